@@ -1,0 +1,1 @@
+"""The vocabulary every part shares: frames, LiDAR, evidence map, observation, policy contract, config."""

@@ -1,0 +1,142 @@
+"""Settings from YAML files and `--set key=value` overrides, checked by pydantic, with errors that name key and line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from imagine.core.errors import InputError
+
+
+class Settings(BaseModel):
+    """Base of all settings: immutable, unknown keys refused, no silent conversion of text to numbers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+S = TypeVar("S", bound=BaseModel)
+KeyPath = tuple[str | int, ...]
+
+
+def load_settings(model: type[S], path: Path | None, overrides: Sequence[str] = ()) -> S:
+    """Read a settings file (None: all defaults), apply `key.sub=value` overrides, and check the result.
+
+    Raises InputError with file, line, key and the nearest valid key.
+    """
+    data, lines = ({}, {}) if path is None else read_yaml(path)
+    data = apply_overrides(data, overrides)
+    return check_settings(model, data, where=str(path) if path else "settings", lines=lines)
+
+
+def read_yaml(path: Path) -> tuple[dict[str, Any], dict[KeyPath, int]]:
+    """Read a YAML mapping; return it with the line of every key. Raises InputError naming file and line."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise InputError(f"{path}: cannot be read: {reason}") from error
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, where: str) -> tuple[dict[str, Any], dict[KeyPath, int]]:
+    """Parse YAML text as `read_yaml` does; `where` names it in errors."""
+    try:
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark else ""
+        raise InputError(f"{where}{line}: not valid YAML: {getattr(error, 'problem', None) or error}") from error
+    if data is None:
+        return {}, {}
+    if not isinstance(data, dict):
+        raise InputError(f"{where}:1: expected keys and values, found {type(data).__name__}")
+    lines: dict[KeyPath, int] = {}
+    _collect_lines(node, (), lines)
+    return data, lines
+
+
+def _collect_lines(node: yaml.Node | None, at: KeyPath, lines: dict[KeyPath, int]) -> None:
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            lines[(*at, key.value)] = key.start_mark.line + 1
+            _collect_lines(value, (*at, key.value), lines)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value in enumerate(node.value):
+            lines[(*at, index)] = value.start_mark.line + 1
+            _collect_lines(value, (*at, index), lines)
+
+
+def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """Return `data` with `key.sub=value` overrides laid over it; values are read as YAML."""
+    merged = {k: v for k, v in data.items()}
+    for override in overrides:
+        key, equals, raw = override.partition("=")
+        if not equals or not key.strip():
+            raise InputError(f"--set {override}: expected key=value, for example --set ppo.lr=1e-4")
+        try:
+            value = yaml.safe_load(raw)
+        except yaml.YAMLError as error:
+            raise InputError(f"--set {override}: the value is not valid YAML") from error
+        if isinstance(value, str):
+            value = _number(value)
+        target = merged
+        parts = key.strip().split(".")
+        for part in parts[:-1]:
+            child = target.get(part)
+            target[part] = dict(child) if isinstance(child, dict) else {}
+            target = target[part]
+        target[parts[-1]] = value
+    return merged
+
+
+def _number(text: str) -> Any:
+    """Read 1e-4, which YAML 1.1 takes for text, as the number it is."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def check_settings(model: type[S], data: dict[str, Any], where: str, lines: dict[KeyPath, int] | None = None) -> S:
+    """Check a mapping against a settings model. Raises InputError naming place, line, key and remedy."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        location: KeyPath = tuple(first["loc"])
+        line = _line_of(location, lines or {})
+        key = ".".join(map(str, location)) or "(whole file)"
+        place = f"{where}:{line}" if line else where
+        if first["type"] == "extra_forbidden":
+            raise InputError(f"{place}: unknown key '{key}'{_nearest(model, location)}") from error
+        if first["type"] == "missing":
+            raise InputError(f"{place}: key '{key}' is missing") from error
+        got = first.get("input")
+        message = first["msg"].removeprefix("Value error, ")
+        raise InputError(f"{place}: {key}: {message} (got {got!r:.80})") from error
+
+
+def _line_of(location: KeyPath, lines: dict[KeyPath, int]) -> int | None:
+    for end in range(len(location), 0, -1):
+        if location[:end] in lines:
+            return lines[location[:end]]
+    return None
+
+
+def _nearest(model: type[BaseModel], location: KeyPath) -> str:
+    """Suggest the nearest valid key beside an unknown one, or list them all."""
+    parent: Any = model
+    for part in location[:-1]:
+        info = parent.model_fields.get(part) if isinstance(part, str) and hasattr(parent, "model_fields") else None
+        parent = info.annotation if info is not None else None
+        if not (isinstance(parent, type) and issubclass(parent, BaseModel)):
+            return ""
+    names = list(parent.model_fields)
+    close = difflib.get_close_matches(str(location[-1]), names, n=1, cutoff=0.5)
+    return f"; did you mean '{close[0]}'?" if close else f"; valid keys: {', '.join(names)}"

@@ -1,0 +1,91 @@
+"""The policy contract: what a model needs and gives, carried as JSON inside the ONNX file.
+
+`onboard` builds its pipeline from it and refuses a model whose contract it cannot honour.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any, Literal
+
+from pydantic import Field
+
+from imagine.core.config import Settings, check_settings
+from imagine.core.errors import InputError
+from imagine.core.lidar import LidarSpec
+from imagine.core.mapping import MapSettings
+from imagine.core.observation_spec import ObservationSpec
+from imagine.core.vehicle_limits import VehicleLimits
+
+CONTRACT_KEY = "imagine.contract"
+"""Key of the contract among the ONNX file's metadata properties."""
+CONTRACT_VERSION = 1
+
+
+class ActionSpec(Settings):
+    """What the model's output means: numbers in [-1, 1], scaled by the limits.
+
+    `plane`: (vx, vy) along the observation's axes, no rotation. `body`: (vx forward, vy left, yaw rate). Scaling of
+    plane velocity keeps its direction: vectors longer than 1 are shortened to 1.
+    """
+
+    mode: Literal["plane", "body"] = "plane"
+    speed_mps: float = Field(default=0.8, gt=0.0)
+    yaw_rate_rps: float = Field(default=3.0, gt=0.0)
+
+    @property
+    def size(self) -> int:
+        """Numbers in an action."""
+        return 2 if self.mode == "plane" else 3
+
+
+class LidarContract(Settings):
+    """The LiDAR a policy was trained with; fields as in `LidarSpec`."""
+
+    beams: int
+    fov: float
+    range_min: float
+    range_max: float
+    rate_hz: float
+    noise_std: float
+    start: float
+
+    @staticmethod
+    def of(spec: LidarSpec) -> LidarContract:
+        """Record a sensor."""
+        return LidarContract(**dataclasses.asdict(spec))
+
+    def spec(self) -> LidarSpec:
+        """Return the sensor."""
+        return LidarSpec(**self.model_dump())
+
+
+class PolicyContract(Settings):
+    """Everything a runner must match to fly a model as it was trained."""
+
+    contract_version: Literal[1] = CONTRACT_VERSION
+    name: str = Field(min_length=1, max_length=100)
+    observation: ObservationSpec
+    action: ActionSpec
+    rate_hz: float = Field(gt=0.0, le=100.0)
+    lidar: LidarContract
+    map: MapSettings
+    limits: VehicleLimits
+    training: dict[str, Any] = Field(default_factory=dict, description="run, config, steps and result, for the record")
+    weights_sha256: str = Field(default="", description="hash of the model's initialisers, in order of name")
+
+    def to_json(self) -> str:
+        """Return the contract as the JSON text that the ONNX file carries."""
+        return json.dumps(self.model_dump(mode="json"), sort_keys=True)
+
+    @staticmethod
+    def from_json(text: str, where: str) -> PolicyContract:
+        """Read a contract; `where` names the model in errors. Raises InputError naming the field that does not fit."""
+        try:
+            data = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise InputError(f"{where}: its contract is not valid JSON (character {error.pos})") from error
+        if not isinstance(data, dict):
+            raise InputError(f"{where}: its contract is not a JSON object")
+        return check_settings(PolicyContract, data, where=f"{where}: contract")

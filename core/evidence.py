@@ -1,0 +1,201 @@
+"""The evidence map: one int8 log-odds layer per source, each tile with a version that only its source advances.
+
+Merging takes the newer version of a tile and the belief is the clamped sum over sources, computed when read. So
+merging is idempotent, commutative and associative (a state-based CRDT with single writers, Shapiro et al. 2011):
+order, duplicates, loss and relays cannot count evidence twice.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine.core.errors import InputError
+from imagine.core.frames import Pose
+from imagine.core.lidar import LidarSpec, Scan
+from imagine.core.raster import CELL, LIMIT, TILE, integrate_scan, sum_layers
+
+MAX_TILES = 160
+"""Largest extent of a map, in tiles along an axis (512 m): a bound on memory whatever arrives."""
+
+
+class TileKey(NamedTuple):
+    """A tile's place in the map frame, in tiles from the origin: column along x, row along y."""
+
+    column: int
+    row: int
+
+
+@dataclass
+class Layer:
+    """What one source has seen: `cells` int8 `[rows, columns]`, and per tile its version and whether it is provisional.
+
+    A tile is provisional when a peer's scan was drawn ahead of the tile itself: good for the belief, never relayed.
+    """
+
+    cells: NDArray[np.int8]
+    versions: NDArray[np.uint32]
+    provisional: NDArray[np.bool_]
+    clock: int = 0
+
+    @staticmethod
+    def empty(tile_rows: int, tile_columns: int) -> Layer:
+        """Return a layer without evidence, `tile_rows` by `tile_columns` tiles."""
+        return Layer(
+            cells=np.zeros((tile_rows * TILE, tile_columns * TILE), np.int8),
+            versions=np.zeros((tile_rows, tile_columns), np.uint32),
+            provisional=np.zeros((tile_rows, tile_columns), np.bool_),
+        )
+
+
+class EvidenceMap:
+    """The layers of all sources a drone knows of, on one grid that grows by whole tiles.
+
+    Sources are small integers (drone ids). Metres and radians, map frame.
+    """
+
+    def __init__(self, own: int, half_extent_m: float = 12.8) -> None:
+        """Make an empty map for drone `own`, reserving `half_extent_m` around the origin."""
+        tiles = max(1, math.ceil(half_extent_m / (CELL * TILE)))
+        self.own = own
+        self.corner = TileKey(-tiles, -tiles)
+        self.tile_rows = self.tile_columns = 2 * tiles
+        self.layers: dict[int, Layer] = {own: Layer.empty(self.tile_rows, self.tile_columns)}
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the grid, in cells."""
+        return self.tile_rows * TILE, self.tile_columns * TILE
+
+    @property
+    def origin_cells(self) -> tuple[int, int]:
+        """Column and row, in cells of the map frame, of the grid's first cell."""
+        return self.corner.column * TILE, self.corner.row * TILE
+
+    def layer(self, source: int) -> Layer:
+        """Return the layer of a source, made empty if it is new."""
+        if source not in self.layers:
+            self.layers[source] = Layer.empty(self.tile_rows, self.tile_columns)
+        return self.layers[source]
+
+    def integrate(self, pose: Pose, scan: Scan, spec: LidarSpec, range_cap_m: float) -> int:
+        """Add the drone's own scan, taken at `pose`, to its own layer; return how many cells changed."""
+        changed, touched = self._draw(self.own, pose, scan, spec, range_cap_m)
+        if changed:
+            layer = self.layers[self.own]
+            layer.clock += 1
+            layer.versions[touched] = layer.clock
+        return changed
+
+    def integrate_provisional(self, source: int, pose: Pose, scan: Scan, spec: LidarSpec, range_cap_m: float) -> int:
+        """Draw a peer's scan into the peer's layer ahead of its tiles; the tiles it changes turn provisional."""
+        if source == self.own:
+            raise InputError(f"source {source} is this drone itself: its scans are not a peer's")
+        changed, touched = self._draw(source, pose, scan, spec, range_cap_m)
+        self.layers[source].provisional |= touched
+        return changed
+
+    def _draw(
+        self, source: int, pose: Pose, scan: Scan, spec: LidarSpec, range_cap_m: float
+    ) -> tuple[int, NDArray[np.bool_]]:
+        if not all(map(math.isfinite, pose)):
+            raise InputError(f"pose {tuple(pose)} is not finite")
+        self.cover(pose.x - range_cap_m, pose.y - range_cap_m, pose.x + range_cap_m, pose.y + range_cap_m)
+        layer = self.layer(source)
+        touched = np.zeros((self.tile_rows, self.tile_columns), np.bool_)
+        column0, row0 = self.origin_cells
+        changed = integrate_scan(
+            layer.cells, touched, column0, row0,
+            pose.x, pose.y, pose.yaw, spec.start, spec.increment, scan.ranges, spec.range_min, range_cap_m,
+        )  # fmt: skip
+        return int(changed), touched
+
+    def tile(self, source: int, key: TileKey) -> NDArray[np.int8]:
+        """Return the cells of one tile of a source's layer, int8 `[TILE, TILE]`; a view, zeros where unheld."""
+        row, column = key.row - self.corner.row, key.column - self.corner.column
+        if source not in self.layers or not (0 <= row < self.tile_rows and 0 <= column < self.tile_columns):
+            return np.zeros((TILE, TILE), np.int8)
+        return self.layers[source].cells[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
+
+    def versions(self, source: int) -> dict[TileKey, int]:
+        """Return the version of every tile this map holds of a source; tiles never seen are left out."""
+        layer = self.layers.get(source)
+        if layer is None:
+            return {}
+        rows, columns = np.nonzero(layer.versions)
+        return {
+            TileKey(int(c) + self.corner.column, int(r) + self.corner.row): int(layer.versions[r, c])
+            for r, c in zip(rows, columns, strict=True)
+        }
+
+    def is_provisional(self, source: int, key: TileKey) -> bool:
+        """Tell whether a tile holds scans drawn ahead of it, which must not be relayed."""
+        row, column = key.row - self.corner.row, key.column - self.corner.column
+        layer = self.layers.get(source)
+        if layer is None or not (0 <= row < self.tile_rows and 0 <= column < self.tile_columns):
+            return False
+        return bool(layer.provisional[row, column])
+
+    def merge_tile(self, source: int, key: TileKey, version: int, cells: NDArray[np.int8]) -> bool:
+        """Take a tile of another source if it is newer than what is held; tell whether it was taken.
+
+        Raises InputError on the drone's own source (only the drone itself writes it), on cells of the wrong shape or
+        out of range, and on a tile too far away to hold.
+        """
+        if source == self.own:
+            raise InputError(f"a tile of source {source} came from outside, but only drone {source} writes it")
+        if cells.shape != (TILE, TILE) or cells.dtype != np.int8:
+            raise InputError(f"a tile is int8 {TILE}x{TILE}, got {cells.dtype} {cells.shape}")
+        if version < 1 or np.abs(cells.astype(np.int16)).max() > LIMIT:
+            raise InputError(f"tile {tuple(key)} of source {source}: version {version} or its cells are out of range")
+        self._cover_tiles(key.column, key.row, key.column, key.row)
+        layer = self.layer(source)
+        row, column = key.row - self.corner.row, key.column - self.corner.column
+        if version <= layer.versions[row, column]:
+            return False
+        self.tile(source, key)[:] = cells
+        layer.versions[row, column] = version
+        layer.provisional[row, column] = False
+        layer.clock = max(layer.clock, version)
+        return True
+
+    def belief(self) -> NDArray[np.int8]:
+        """Return the clamped sum over sources, int8 `[rows, columns]`: negative free, positive occupied, 0 unknown."""
+        out = np.empty(self.shape, np.int8)
+        sum_layers(np.stack([layer.cells for layer in self.layers.values()]), out)
+        return out
+
+    def cover(self, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
+        """Grow the grid to hold a rectangle of the map frame, metres; raise InputError past the largest extent."""
+        side = CELL * TILE
+        self._cover_tiles(
+            math.floor(x_min / side), math.floor(y_min / side), math.floor(x_max / side), math.floor(y_max / side)
+        )
+
+    def _cover_tiles(self, column_min: int, row_min: int, column_max: int, row_max: int) -> None:
+        low = TileKey(min(column_min, self.corner.column), min(row_min, self.corner.row))
+        high_column = max(column_max + 1, self.corner.column + self.tile_columns)
+        high_row = max(row_max + 1, self.corner.row + self.tile_rows)
+        rows, columns = high_row - low.row, high_column - low.column
+        if low == self.corner and (rows, columns) == (self.tile_rows, self.tile_columns):
+            return
+        if rows > MAX_TILES or columns > MAX_TILES:
+            raise InputError(
+                f"the map would grow to {columns}x{rows} tiles, over the limit of {MAX_TILES}: "
+                "a pose or tile lies far outside"
+            )
+        for source, old in self.layers.items():
+            new = Layer.empty(rows, columns)
+            row, column = self.corner.row - low.row, self.corner.column - low.column
+            tiles = slice(row, row + self.tile_rows), slice(column, column + self.tile_columns)
+            new.versions[tiles], new.provisional[tiles] = old.versions, old.provisional
+            new.cells[
+                row * TILE : (row + self.tile_rows) * TILE, column * TILE : (column + self.tile_columns) * TILE
+            ] = old.cells
+            new.clock = old.clock
+            self.layers[source] = new
+        self.corner, self.tile_rows, self.tile_columns = low, rows, columns

@@ -1,0 +1,102 @@
+"""2D LiDAR: what a sensor is, and what one turn of it gives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class LidarSpec:
+    """A 2D LiDAR: beam i looks along `start + i * fov / beams`, counter-clockwise from straight ahead.
+
+    Angles in radians, ranges and noise in metres, rate in hertz. A full turn has `start` 0: beam 0 is straight ahead.
+    """
+
+    beams: int
+    fov: float = 2.0 * math.pi
+    range_min: float = 0.05
+    range_max: float = 12.0
+    rate_hz: float = 10.0
+    noise_std: float = 0.01
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.beams < 1:
+            raise InputError(f"LiDAR: beams is {self.beams}, needs at least 1")
+        if not 0.0 < self.fov <= 2.0 * math.pi + 1e-9:
+            raise InputError(f"LiDAR: fov is {self.fov} rad, needs to be in (0, 2 pi]")
+        if not 0.0 <= self.range_min < self.range_max:
+            raise InputError(f"LiDAR: range_min {self.range_min} m must lie below range_max {self.range_max} m")
+        if self.rate_hz <= 0.0:
+            raise InputError(f"LiDAR: rate_hz is {self.rate_hz}, needs to be positive")
+
+    @property
+    def increment(self) -> float:
+        """Angle between neighbouring beams, in radians."""
+        return self.fov / self.beams
+
+    @cached_property
+    def bearings(self) -> NDArray[np.float64]:
+        """Bearing of each beam in the body frame, radians, `[beams]`."""
+        return self.start + np.arange(self.beams) * self.increment
+
+
+LD19 = LidarSpec(beams=360)
+"""The reference sensor: LDRobot LD19 class, 360 beams over 360 degrees, 0.05-12 m, 10 Hz."""
+
+PRESETS: dict[str, LidarSpec] = {"ld19": LD19}
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One turn of a LiDAR: stamp in seconds, ranges in metres, no return = inf, invalid = nan."""
+
+    stamp: float
+    ranges: NDArray[np.float32] = field(repr=False)
+
+
+def returns(scan: Scan, spec: LidarSpec) -> NDArray[np.bool_]:
+    """Tell which beams hit something the sensor can measure, `[beams]`."""
+    r = scan.ranges
+    return np.isfinite(r) & (r >= spec.range_min) & (r <= spec.range_max)
+
+
+def points(scan: Scan, spec: LidarSpec) -> NDArray[np.float64]:
+    """Return the hit points in the body frame, metres, `[hits, 2]`."""
+    hit = returns(scan, spec)
+    r = scan.ranges[hit].astype(np.float64)
+    bearing = spec.bearings[hit]
+    return np.column_stack((r * np.cos(bearing), r * np.sin(bearing)))
+
+
+def mask_near(
+    ranges: NDArray[np.float32],
+    spec: LidarSpec,
+    pose: tuple[float, float, float],
+    targets: NDArray[np.float64],
+    radius: float,
+) -> NDArray[np.float32]:
+    """Return the ranges with every return that lands within `radius` of a target made invalid (nan).
+
+    Teammates are seen by the LiDAR but must not be mapped. `pose` and `targets` `[n, 2]` are in the map frame, metres.
+    """
+    if len(targets) == 0:
+        return ranges
+    x, y, yaw = pose
+    r = np.where(np.isfinite(ranges), ranges, np.inf).astype(np.float64)
+    bearing = spec.bearings + yaw
+    with np.errstate(invalid="ignore"):
+        hit_x, hit_y = x + r * np.cos(bearing), y + r * np.sin(bearing)
+    out = ranges.copy()
+    for tx, ty in targets:
+        with np.errstate(invalid="ignore"):
+            near = (hit_x - tx) ** 2 + (hit_y - ty) ** 2 < radius * radius
+        out[near] = np.nan
+    return out
