@@ -74,7 +74,7 @@ def _collect_lines(node: yaml.Node | None, at: KeyPath, lines: dict[KeyPath, int
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """Return `data` with `key.sub=value` overrides laid over it; values are read as YAML."""
-    merged = {k: v for k, v in data.items()}
+    merged = dict(data)
     for override in overrides:
         key, equals, raw = override.partition("=")
         if not equals or not key.strip():

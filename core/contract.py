@@ -20,7 +20,6 @@ from imagine.core.vehicle_limits import VehicleLimits
 
 CONTRACT_KEY = "imagine.contract"
 """Key of the contract among the ONNX file's metadata properties."""
-CONTRACT_VERSION = 1
 
 
 class ActionSpec(Settings):
@@ -64,7 +63,7 @@ class LidarContract(Settings):
 class PolicyContract(Settings):
     """Everything a runner must match to fly a model as it was trained."""
 
-    contract_version: Literal[1] = CONTRACT_VERSION
+    contract_version: Literal[1] = 1
     name: str = Field(min_length=1, max_length=100)
     observation: ObservationSpec
     action: ActionSpec

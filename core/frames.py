@@ -46,7 +46,8 @@ def relative(a: Pose, b: Pose) -> Pose:
 def transform_points(pose: Pose, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Carry points `[n, 2]` from the frame of `pose` into the frame `pose` is given in."""
     c, s = math.cos(pose.yaw), math.sin(pose.yaw)
-    return points @ np.array([[c, s], [-s, c]]) + np.array([pose.x, pose.y])
+    moved: NDArray[np.float64] = points @ np.array([[c, s], [-s, c]]) + np.array([pose.x, pose.y])
+    return moved
 
 
 def rotate(yaw: float, x: float, y: float) -> tuple[float, float]:

@@ -45,7 +45,7 @@ class LidarSpec:
     @cached_property
     def bearings(self) -> NDArray[np.float64]:
         """Bearing of each beam in the body frame, radians, `[beams]`."""
-        return self.start + np.arange(self.beams) * self.increment
+        return self.start + np.arange(self.beams, dtype=np.float64) * self.increment
 
 
 LD19 = LidarSpec(beams=360)

@@ -9,8 +9,6 @@ from pydantic import Field, field_validator
 from imagine.core.config import Settings
 from imagine.core.raster import CELL
 
-OBSERVATION_VERSION = 1
-
 
 class ObservationSpec(Settings):
     """Egocentric views of the belief at several scales, pooled LiDAR ranges and the drone's own motion.
@@ -20,7 +18,7 @@ class ObservationSpec(Settings):
     `axes` says how views, LiDAR sectors, velocity and a plane action are turned: along the map's axes or the heading.
     """
 
-    version: Literal[1] = OBSERVATION_VERSION
+    version: Literal[1] = 1
     view_cells: int = Field(default=32, ge=8, le=128, multiple_of=2)
     view_scales_m: tuple[float, ...] = Field(default=(0.1, 0.4), min_length=1, max_length=4)
     frontier_ranges_m: tuple[float, ...] = Field(

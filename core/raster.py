@@ -59,19 +59,19 @@ def integrate_scan(  # type: ignore[no-untyped-def]
     Cells outside the grid are left out. Pose in metres and radians; (column0, row0) is the grid's origin in cells.
     """
     rows, columns = cells.shape
-    reach = int(math.ceil(range_cap / CELL)) + 1
+    reach = math.ceil(range_cap / CELL) + 1
     side = 2 * reach + 1
     marks = np.zeros((side, side), dtype=np.uint8)
-    own_column = int(math.floor(x / CELL))
-    own_row = int(math.floor(y / CELL))
+    own_column = math.floor(x / CELL)
+    own_row = math.floor(y / CELL)
     corner_column, corner_row = own_column - reach, own_row - reach
 
     for beam in range(ranges.shape[0]):  # hits first: they win over misses of the same scan
         r = ranges[beam]
         if range_min <= r <= range_cap:
             bearing = yaw + start + beam * increment
-            column = int(math.floor((x + r * math.cos(bearing)) / CELL)) - corner_column
-            row = int(math.floor((y + r * math.sin(bearing)) / CELL)) - corner_row
+            column = math.floor((x + r * math.cos(bearing)) / CELL) - corner_column
+            row = math.floor((y + r * math.sin(bearing)) / CELL) - corner_row
             marks[row, column] = _HIT
     for beam in range(ranges.shape[0]):
         r = ranges[beam]
@@ -79,8 +79,8 @@ def integrate_scan(  # type: ignore[no-untyped-def]
             continue
         length = min(r, range_cap)
         bearing = yaw + start + beam * increment
-        column = int(math.floor((x + length * math.cos(bearing)) / CELL)) - corner_column
-        row = int(math.floor((y + length * math.sin(bearing)) / CELL)) - corner_row
+        column = math.floor((x + length * math.cos(bearing)) / CELL) - corner_column
+        row = math.floor((y + length * math.sin(bearing)) / CELL) - corner_row
         _trace(marks, reach, reach, row, column)
 
     changed = 0
@@ -92,10 +92,7 @@ def integrate_scan(  # type: ignore[no-untyped-def]
                 continue
             column = j + corner_column - column0
             old = cells[row, column]
-            if mark == _HIT:
-                new = min(old + HIT, LIMIT)
-            else:
-                new = max(old + MISS, -LIMIT)
+            new = min(old + HIT, LIMIT) if mark == _HIT else max(old + MISS, -LIMIT)
             if new != old:
                 cells[row, column] = new
                 touched[row // TILE, column // TILE] = True
