@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from imagine.core.config import Settings
 from imagine.core.raster import CELL
@@ -26,6 +26,8 @@ class ObservationSpec(Settings):
     )
     lidar_sectors: int = Field(default=64, ge=4, le=720)
     lidar_range_m: float = Field(default=4.0, gt=0.0, description="range that reads as 1, metres")
+    speed_mps: float = Field(default=0.8, gt=0.0, description="speed that reads as 1")
+    yaw_rate_rps: float = Field(default=3.0, gt=0.0, description="yaw rate that reads as 1")
     axes: Literal["map", "heading"] = "map"
 
     @field_validator("view_scales_m")
@@ -35,6 +37,12 @@ class ObservationSpec(Settings):
             if scale not in (0.1, 0.2, 0.4, 0.8):
                 raise ValueError(f"a view scale is one of 0.1, 0.2, 0.4, 0.8 m, got {scale} (a cell is {CELL} m)")
         return scales
+
+    @model_validator(mode="after")
+    def _one_range_a_scale(self) -> Self:
+        if len(self.frontier_ranges_m) != len(self.view_scales_m):
+            raise ValueError("frontier_ranges_m needs one range for each of view_scales_m")
+        return self
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:

@@ -1,0 +1,175 @@
+"""Distance to the nearest frontier through known free space: the field that planner and policy both read.
+
+A frontier is known free space beside unknown space (Yamauchi 1997). The field lives on a 0.2 m planning grid, two
+cells of the map to a side: a quarter of the work, and still two free cells in the narrowest passage a drone may use.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine.core.raster import CELL
+
+PLAN_CELL = 2 * CELL
+"""Side of a planning cell, metres."""
+UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+
+_STRAIGHT, _DIAGONAL = 10, 14  # edge lengths in fiftieths of a metre: 0.20 m and 0.28 m
+_UNITS_PER_M = 50.0
+_NEAR_WALL_COST = 3  # beside an obstacle a metre costs three: paths keep clear of walls where there is room
+_BUCKETS = 64  # above the longest edge, 3 * 14
+_FAR = 2**30
+
+
+@dataclass(frozen=True)
+class FrontierField:
+    """Frontier distances and cell states on the planning grid, `[rows, columns]`.
+
+    `distance`: float32 metres along the cheapest known path, a metre beside obstacles counting threefold; inf where no
+    frontier can be reached. `states`: uint8 UNKNOWN, FREE or OCCUPIED. Row 0, column 0 is the map grid's first cell.
+    """
+
+    distance: NDArray[np.float32]
+    states: NDArray[np.uint8]
+
+
+@numba.njit(cache=True, nogil=True)
+def plan_states(belief, states):  # type: ignore[no-untyped-def]
+    """Reduce a belief (int8 `[2 r, 2 c]`) to planning cells (uint8 `[r, c]`): occupied before free before unknown."""
+    rows, columns = states.shape
+    for row in range(rows):
+        for column in range(columns):
+            a, b = belief[2 * row, 2 * column], belief[2 * row, 2 * column + 1]
+            c, d = belief[2 * row + 1, 2 * column], belief[2 * row + 1, 2 * column + 1]
+            if a > 0 or b > 0 or c > 0 or d > 0:
+                states[row, column] = OCCUPIED
+            elif a < 0 or b < 0 or c < 0 or d < 0:
+                states[row, column] = FREE
+            else:
+                states[row, column] = UNKNOWN
+
+
+@numba.njit(cache=True, nogil=True)
+def _opens(states, row, column):  # type: ignore[no-untyped-def]
+    """Tell whether (row, column) is unknown with unknown beside it: lone unknown cells are not worth a flight."""
+    rows, columns = states.shape
+    if row < 0 or column < 0 or row >= rows or column >= columns:
+        return True
+    if states[row, column] != UNKNOWN:
+        return False
+    for i in range(max(0, row - 1), min(rows, row + 2)):
+        for j in range(max(0, column - 1), min(columns, column + 2)):
+            if (i != row or j != column) and states[i, j] == UNKNOWN:
+                return True
+    return row == 0 or column == 0 or row == rows - 1 or column == columns - 1
+
+
+@numba.njit(cache=True, nogil=True)
+def frontier_distances(states, distance):  # type: ignore[no-untyped-def]
+    """Fill `distance` (float32, as `FrontierField.distance`) by Dial's bucket-queue Dijkstra from all frontiers."""
+    rows, columns = states.shape
+    size = rows * columns
+    cost = np.full(size, _FAR, dtype=np.int32)
+    heads = np.full(_BUCKETS, -1, dtype=np.int32)
+    entry_cell = np.empty(9 * size + 1, dtype=np.int32)  # each settled cell relaxes at most 8 edges
+    entry_next = np.empty(9 * size + 1, dtype=np.int32)
+    entries = 0
+    beside_wall = np.zeros(size, dtype=np.bool_)
+    for row in range(rows):
+        for column in range(columns):
+            state = states[row, column]
+            if state == OCCUPIED:
+                for i in range(max(0, row - 1), min(rows, row + 2)):
+                    for j in range(max(0, column - 1), min(columns, column + 2)):
+                        beside_wall[i * columns + j] = True
+            elif state == FREE and (
+                _opens(states, row - 1, column)
+                or _opens(states, row + 1, column)
+                or _opens(states, row, column - 1)
+                or _opens(states, row, column + 1)
+            ):
+                cell = row * columns + column
+                cost[cell] = 0
+                entry_cell[entries] = cell
+                entry_next[entries] = heads[0]
+                heads[0] = entries
+                entries += 1
+    level, queued = 0, entries
+    while queued > 0:
+        bucket = level % _BUCKETS
+        while heads[bucket] >= 0:
+            entry = heads[bucket]
+            heads[bucket] = entry_next[entry]
+            queued -= 1
+            cell = entry_cell[entry]
+            if cost[cell] != level:
+                continue  # a shorter way was found since
+            row, column = cell // columns, cell % columns
+            for i in range(max(0, row - 1), min(rows, row + 2)):
+                for j in range(max(0, column - 1), min(columns, column + 2)):
+                    if states[i, j] != FREE or (i == row and j == column):
+                        continue
+                    step = _STRAIGHT
+                    if i != row and j != column:
+                        if states[i, column] != FREE or states[row, j] != FREE:
+                            continue  # no cutting of corners
+                        step = _DIAGONAL
+                    other = i * columns + j
+                    if beside_wall[other] or beside_wall[cell]:
+                        step *= _NEAR_WALL_COST
+                    if level + step < cost[other]:
+                        cost[other] = level + step
+                        entry_cell[entries] = other
+                        target = (level + step) % _BUCKETS
+                        entry_next[entries] = heads[target]
+                        heads[target] = entries
+                        entries += 1
+                        queued += 1
+        level += 1
+    for row in range(rows):
+        for column in range(columns):
+            c = cost[row * columns + column]
+            distance[row, column] = np.inf if c == _FAR else c / _UNITS_PER_M
+
+
+@numba.njit(cache=True, nogil=True)
+def distance_at(distance, column, row):  # type: ignore[no-untyped-def]
+    """Return the frontier distance at a planning cell, or the least one within two cells where it has none."""
+    rows, columns = distance.shape
+    best = np.float32(np.inf)
+    for ring in range(3):
+        for i in range(max(0, row - ring), min(rows, row + ring + 1)):
+            for j in range(max(0, column - ring), min(columns, column + ring + 1)):
+                best = min(best, distance[i, j])
+        if best < np.inf:
+            break
+    return best
+
+
+def frontier_field(belief: NDArray[np.int8]) -> FrontierField:
+    """Return the frontier field of a belief (int8 `[rows, columns]`, both even)."""
+    rows, columns = belief.shape[0] // 2, belief.shape[1] // 2
+    states = np.empty((rows, columns), np.uint8)
+    distance = np.empty((rows, columns), np.float32)
+    plan_states(belief, states)
+    frontier_distances(states, distance)
+    return FrontierField(distance, states)
+
+
+def plan_cell(x: float, y: float, origin_cells: tuple[int, int]) -> tuple[int, int]:
+    """Return the planning column and row that hold a point of the map frame, on a grid with this origin in cells."""
+    return (
+        math.floor(x / PLAN_CELL) - origin_cells[0] // 2,
+        math.floor(y / PLAN_CELL) - origin_cells[1] // 2,
+    )
+
+
+def own_distance(field: FrontierField, origin_cells: tuple[int, int], x: float, y: float) -> float:
+    """Return the frontier distance of the drone at (x, y), metres; inf where nothing is left to explore."""
+    column, row = plan_cell(x, y, origin_cells)
+    return float(distance_at(field.distance, column, row))
