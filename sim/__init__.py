@@ -1,0 +1,1 @@
+"""The pymunk twin: levels, physics, rays, radio medium, batched exploration, vehicles in the loop."""
