@@ -43,62 +43,70 @@ def plan_states(belief, states):  # type: ignore[no-untyped-def]
     """Reduce a belief (int8 `[2 r, 2 c]`) to planning cells (uint8 `[r, c]`): occupied before free before unknown."""
     rows, columns = states.shape
     for row in range(rows):
+        upper, lower = belief[2 * row], belief[2 * row + 1]
         for column in range(columns):
-            a, b = belief[2 * row, 2 * column], belief[2 * row, 2 * column + 1]
-            c, d = belief[2 * row + 1, 2 * column], belief[2 * row + 1, 2 * column + 1]
-            if a > 0 or b > 0 or c > 0 or d > 0:
-                states[row, column] = OCCUPIED
-            elif a < 0 or b < 0 or c < 0 or d < 0:
-                states[row, column] = FREE
-            else:
-                states[row, column] = UNKNOWN
+            a, b = upper[2 * column], upper[2 * column + 1]
+            c, d = lower[2 * column], lower[2 * column + 1]
+            occupied = (a > 0) | (b > 0) | (c > 0) | (d > 0)
+            free = (a < 0) | (b < 0) | (c < 0) | (d < 0)
+            states[row, column] = OCCUPIED if occupied else (FREE if free else UNKNOWN)
 
 
 @numba.njit(cache=True, nogil=True)
-def _opens(states, row, column):  # type: ignore[no-untyped-def]
-    """Tell whether (row, column) is unknown with unknown beside it: lone unknown cells are not worth a flight."""
-    rows, columns = states.shape
-    if row < 0 or column < 0 or row >= rows or column >= columns:
-        return True
-    if states[row, column] != UNKNOWN:
+def _opens(padded, cell, width):  # type: ignore[no-untyped-def]
+    """Tell whether a cell is unknown with unknown beside it: lone unknown cells are not worth a flight."""
+    if padded[cell] != UNKNOWN:
         return False
-    for i in range(max(0, row - 1), min(rows, row + 2)):
-        for j in range(max(0, column - 1), min(columns, column + 2)):
-            if (i != row or j != column) and states[i, j] == UNKNOWN:
-                return True
-    return row == 0 or column == 0 or row == rows - 1 or column == columns - 1
+    return (
+        padded[cell - 1] == UNKNOWN
+        or padded[cell + 1] == UNKNOWN
+        or padded[cell - width - 1] == UNKNOWN
+        or padded[cell - width] == UNKNOWN
+        or padded[cell - width + 1] == UNKNOWN
+        or padded[cell + width - 1] == UNKNOWN
+        or padded[cell + width] == UNKNOWN
+        or padded[cell + width + 1] == UNKNOWN
+    )
 
 
 @numba.njit(cache=True, nogil=True)
 def frontier_distances(states, distance):  # type: ignore[no-untyped-def]
     """Fill `distance` (float32, as `FrontierField.distance`) by Dial's bucket-queue Dijkstra from all frontiers."""
     rows, columns = states.shape
-    size = rows * columns
+    width = columns + 4  # two cells of unknown all around spare the loops every test for the edge
+    size = (rows + 4) * width
+    padded = np.zeros(size, dtype=np.uint8)
+    weight = np.ones(size, dtype=np.int32)
     cost = np.full(size, _FAR, dtype=np.int32)
+    for row in range(rows):
+        first = (row + 2) * width + 2
+        for column in range(columns):
+            state = states[row, column]
+            padded[first + column] = state
+            if state == OCCUPIED:
+                for beside in (-width, 0, width):
+                    cell = first + column + beside
+                    weight[cell - 1] = weight[cell] = weight[cell + 1] = _NEAR_WALL_COST
+
     heads = np.full(_BUCKETS, -1, dtype=np.int32)
     entry_cell = np.empty(9 * size + 1, dtype=np.int32)  # each settled cell relaxes at most 8 edges
     entry_next = np.empty(9 * size + 1, dtype=np.int32)
     entries = 0
-    beside_wall = np.zeros(size, dtype=np.bool_)
     for row in range(rows):
-        for column in range(columns):
-            state = states[row, column]
-            if state == OCCUPIED:
-                for i in range(max(0, row - 1), min(rows, row + 2)):
-                    for j in range(max(0, column - 1), min(columns, column + 2)):
-                        beside_wall[i * columns + j] = True
-            elif state == FREE and (
-                _opens(states, row - 1, column)
-                or _opens(states, row + 1, column)
-                or _opens(states, row, column - 1)
-                or _opens(states, row, column + 1)
+        first = (row + 2) * width + 2
+        for cell in range(first, first + columns):
+            if padded[cell] == FREE and (
+                _opens(padded, cell - 1, width)
+                or _opens(padded, cell + 1, width)
+                or _opens(padded, cell - width, width)
+                or _opens(padded, cell + width, width)
             ):
-                cell = row * columns + column
                 cost[cell] = 0
                 entry_cell[entries] = cell
                 entry_next[entries] = heads[0]
                 heads[0] = entries
                 entries += 1
+
     level, queued = 0, entries
     while queued > 0:
         bucket = level % _BUCKETS
@@ -109,32 +117,49 @@ def frontier_distances(states, distance):  # type: ignore[no-untyped-def]
             cell = entry_cell[entry]
             if cost[cell] != level:
                 continue  # a shorter way was found since
-            row, column = cell // columns, cell % columns
-            for i in range(max(0, row - 1), min(rows, row + 2)):
-                for j in range(max(0, column - 1), min(columns, column + 2)):
-                    if states[i, j] != FREE or (i == row and j == column):
-                        continue
+            north, south = padded[cell + width] == FREE, padded[cell - width] == FREE
+            east, west = padded[cell + 1] == FREE, padded[cell - 1] == FREE
+            for way in range(8):
+                if way < 4:
                     step = _STRAIGHT
-                    if i != row and j != column:
-                        if states[i, column] != FREE or states[row, j] != FREE:
-                            continue  # no cutting of corners
-                        step = _DIAGONAL
-                    other = i * columns + j
-                    if beside_wall[other] or beside_wall[cell]:
-                        step *= _NEAR_WALL_COST
-                    if level + step < cost[other]:
-                        cost[other] = level + step
-                        entry_cell[entries] = other
-                        target = (level + step) % _BUCKETS
-                        entry_next[entries] = heads[target]
-                        heads[target] = entries
-                        entries += 1
-                        queued += 1
+                    if way == 0:
+                        other, passable = cell + width, north
+                    elif way == 1:
+                        other, passable = cell - width, south
+                    elif way == 2:
+                        other, passable = cell + 1, east
+                    else:
+                        other, passable = cell - 1, west
+                else:  # a diagonal step cuts no corner: both cells beside it must be free
+                    step = _DIAGONAL
+                    if way == 4:
+                        other, passable = cell + width + 1, north and east
+                    elif way == 5:
+                        other, passable = cell + width - 1, north and west
+                    elif way == 6:
+                        other, passable = cell - width + 1, south and east
+                    else:
+                        other, passable = cell - width - 1, south and west
+                    passable = passable and padded[other] == FREE
+                if not passable:
+                    continue
+                reached = level + step * max(weight[other], weight[cell])
+                if reached < cost[other]:
+                    cost[other] = reached
+                    target = reached % _BUCKETS
+                    entry_cell[entries] = other
+                    entry_next[entries] = heads[target]
+                    heads[target] = entries
+                    entries += 1
+                    queued += 1
         level += 1
+
+    per_unit = np.float32(1.0 / _UNITS_PER_M)
     for row in range(rows):
+        first = (row + 2) * width + 2
         for column in range(columns):
-            c = cost[row * columns + column]
-            distance[row, column] = np.inf if c == _FAR else c / _UNITS_PER_M
+            c = cost[first + column]
+            distance[row, column] = np.float32(np.inf) if c == _FAR else np.float32(c) * per_unit
 
 
 @numba.njit(cache=True, nogil=True)

@@ -21,15 +21,17 @@ def _pooled_occupancy(belief, row, column, block):  # type: ignore[no-untyped-de
     rows, columns = belief.shape
     if row < 0 or column < 0 or row + block > rows or column + block > columns:
         return np.float32(0.0)
-    total, strongest = 0, 0
+    if block == 1:
+        return np.float32(belief[row, column]) * np.float32(1.0 / LIMIT)
+    total, strongest = np.int32(0), np.int32(0)
     for i in range(row, row + block):
         for j in range(column, column + block):
-            value = belief[i, j]
+            value = np.int32(belief[i, j])
             total += value
             strongest = max(strongest, value)
     if strongest > 0:
-        return np.float32(strongest / LIMIT)
-    return np.float32(total / (LIMIT * block * block))
+        return np.float32(strongest) * np.float32(1.0 / LIMIT)
+    return np.float32(total) / np.float32(LIMIT * block * block)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -56,23 +58,28 @@ def fill_views(  # type: ignore[no-untyped-def]
     own_row = math.floor(y / (2.0 * CELL)) - row0 // 2
     own = distance_at(distance, own_column, own_row)
     cos_turn, sin_turn = math.cos(turn), math.sin(turn)
+    columns_of = np.empty(n, dtype=np.int64)
     for k in range(len(scales)):
         scale = scales[k]
         block = round(scale / CELL)
         plan_block = max(1, block // 2)
+        if turn == 0.0:
+            for j in range(n):
+                columns_of[j] = math.floor((x + (j + 0.5 - 0.5 * n) * scale) / scale) * block - column0
         for i in range(n):
             v = (i + 0.5 - 0.5 * n) * scale
+            row = math.floor((y + v) / scale) * block - row0
             for j in range(n):
-                u = (j + 0.5 - 0.5 * n) * scale
-                cell_x = x + cos_turn * u - sin_turn * v
-                cell_y = y + sin_turn * u + cos_turn * v
-                column = math.floor(cell_x / scale) * block - column0
-                row = math.floor(cell_y / scale) * block - row0
+                column = columns_of[j]
+                if turn != 0.0:
+                    u = (j + 0.5 - 0.5 * n) * scale
+                    column = math.floor((x + cos_turn * u - sin_turn * v) / scale) * block - column0
+                    row = math.floor((y + sin_turn * u + cos_turn * v) / scale) * block - row0
                 views[2 * k, i, j] = _pooled_occupancy(belief, row, column, block)
                 here = _pooled_distance(distance, row >> 1, column >> 1, plan_block)
                 if here < np.inf and own < np.inf:
-                    relative = (here - own) / frontier_ranges[k]
-                    views[2 * k + 1, i, j] = min(max(relative, -1.0), 1.0)
+                    relative = (here - own) / np.float32(frontier_ranges[k])
+                    views[2 * k + 1, i, j] = min(max(relative, np.float32(-1.0)), np.float32(1.0))
                 else:
                     views[2 * k + 1, i, j] = 1.0
 

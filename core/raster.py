@@ -104,12 +104,15 @@ def integrate_scan(  # type: ignore[no-untyped-def]
 def sum_layers(layers, out):  # type: ignore[no-untyped-def]
     """Write the clamped sum over sources of `layers` (int8 `[sources, rows, columns]`) into `out` (int8)."""
     sources, rows, columns = layers.shape
-    for row in range(rows):
+    total = np.empty(columns, dtype=np.int16)
+    for row in range(rows):  # row by row in int16, which compiles to vector instructions
         for column in range(columns):
-            total = 0
-            for source in range(sources):
-                total += layers[source, row, column]
-            out[row, column] = min(max(total, -LIMIT), LIMIT)
+            total[column] = layers[0, row, column]
+        for source in range(1, sources):
+            for column in range(columns):
+                total[column] += np.int16(layers[source, row, column])
+        for column in range(columns):
+            out[row, column] = np.int8(min(max(total[column], np.int16(-LIMIT)), np.int16(LIMIT)))
 
 
 def probability(log_odds_units: NDArray[np.int8]) -> NDArray[np.float64]:

@@ -277,3 +277,27 @@ def _flood(free: NDArray[np.bool_], seed: tuple[int, int]) -> NDArray[np.bool_]:
                 reached[i, j] = True
                 stack.append((i, j))
     return reached
+
+
+def mirrored(level: Level, swap_axes: bool, flip_x: bool, flip_y: bool) -> Level:
+    """Return the level seen in a mirror: axes swapped, then turned round along x, along y; the outline stays put."""
+    low, high = level.outline.min(axis=0), level.outline.max(axis=0)
+    if swap_axes:
+        low, high = low[::-1], high[::-1]
+
+    def move(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        moved = points[:, ::-1].copy() if swap_axes else points.copy()
+        for axis, flip in ((0, flip_x), (1, flip_y)):
+            if flip:
+                moved[:, axis] = low[axis] + high[axis] - moved[:, axis]
+        return moved
+
+    launch = move(np.array([level.launch]))[0]
+    return Level(
+        level.name,
+        level.title,
+        move(level.outline),
+        tuple(move(polygon) for polygon in level.polygons),
+        np.hstack((move(level.circles[:, :2]), level.circles[:, 2:])),
+        (float(launch[0]), float(launch[1])),
+    )

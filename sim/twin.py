@@ -37,6 +37,9 @@ _ARBITER_FIELDS = (
 )
 
 
+_Geometry = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
+
+
 class Twin:
     """Worlds of drones: poses and velocities `[worlds, drones, 3]`, in metres, radians and seconds, map frame.
 
@@ -78,7 +81,7 @@ class Twin:
         self._forces = pymunk.batch.Buffer()
         self._motion = pymunk.batch.Buffer()
         self._arbiters = pymunk.batch.Buffer()
-        self._segments: list[NDArray[np.float64]] = [level.segments for level in levels]
+        self._geometry: _Geometry | None = None
         for world, level in enumerate(levels):
             self.set_level(world, level, level.launch_poses(drones))
 
@@ -112,7 +115,7 @@ class Twin:
         self._space.add(*shapes)
         self._statics[world] = shapes
         self.levels[world] = level
-        self._segments[world] = level.segments
+        self._geometry = None
         self.poses[world] = poses
         self.velocity[world] = 0.0
         self.contacts[world] = 0
@@ -176,17 +179,31 @@ class Twin:
         Ranges in metres with the sensor's noise; inf no return, nan below the least range.
         """
         ranges = np.empty((self.worlds, self.drones, self.lidar.beams), np.float32)
-        for world in range(self.worlds):
-            scan_world(
-                ranges[world], self._segments[world], self.levels[world].circles, self.poses[world],
-                self.limits.radius_m, self.lidar.start, self.lidar.increment, self.lidar.range_min,
-                self.lidar.range_max, self.lidar.noise_std, self.noise_key(world),
-            )  # fmt: skip
+        keys = np.array([self.noise_key(world) for world in range(self.worlds)], np.uint64)
+        if self._geometry is None:
+            self._geometry = _stack([level.segments for level in self.levels], [lv.circles for lv in self.levels])
+        segments, segment_counts, circles, circle_counts = self._geometry
+        lidar = self.lidar
+        _scan_worlds(
+            ranges, segments, segment_counts, circles, circle_counts, self.poses, self.limits.radius_m,
+            (lidar.start, lidar.increment, lidar.range_min, lidar.range_max, lidar.noise_std), keys,
+        )  # fmt: skip
         return ranges
 
     def noise_key(self, world: int) -> int:
         """Return the number that this tick's sensor noise of a world is drawn from."""
         return (self.seed * 1_000_003 + world) * 1_000_003 + self.ticks
+
+
+def _stack(segments: list[NDArray[np.float64]], circles: list[NDArray[np.float64]]) -> _Geometry:
+    """Lay ragged geometry of all worlds into arrays `[worlds, most, 4]` and `[worlds, most, 3]` with their counts."""
+    segment_counts = np.array([len(s) for s in segments])
+    circle_counts = np.array([len(c) for c in circles])
+    all_segments = np.zeros((len(segments), segment_counts.max(), 4))
+    all_circles = np.zeros((len(circles), circle_counts.max(), 3))
+    for world, (s, c) in enumerate(zip(segments, circles, strict=True)):
+        all_segments[world, : len(s)], all_circles[world, : len(c)] = s, c
+    return all_segments, segment_counts, all_circles, circle_counts
 
 
 @numba.njit(cache=True, nogil=True)
@@ -210,25 +227,30 @@ def _control(forces, velocity, yaw, wanted, dt, lag, acceleration, speed, fastes
         yaw[k] += velocity[k, 2] * dt
 
 
-@numba.njit(cache=True, nogil=True)
-def scan_world(  # type: ignore[no-untyped-def]
-    ranges, segments, circles, poses, drone_radius, start, increment, range_min, range_max, noise_std, key
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _scan_worlds(  # type: ignore[no-untyped-def]
+    ranges, segments, segment_counts, circles, circle_counts, poses, drone_radius, lidar, keys
 ):
-    """Fill one world's `ranges` (float32 `[drones, beams]`): level, other drones, and noise drawn from `key`."""
-    drones, beams = ranges.shape
-    posts = len(circles)
-    round_things = np.empty((posts + drones - 1, 3))
-    round_things[:posts] = circles
-    exact = np.empty(beams)
-    for drone in range(drones):
+    """Fill `ranges` (float32 `[worlds, drones, beams]`): level, other drones, and noise drawn from the world's key."""
+    start, increment, range_min, range_max, noise_std = lidar
+    worlds, drones, beams = ranges.shape
+    for index in numba.prange(worlds * drones):
+        world, drone = index // drones, index % drones
+        posts = circle_counts[world]
+        round_things = np.empty((posts + drones - 1, 3))
+        round_things[:posts] = circles[world, :posts]
         count = posts
         for other in range(drones):
             if other != drone:
-                round_things[count, 0], round_things[count, 1] = poses[other, 0], poses[other, 1]
+                round_things[count, 0], round_things[count, 1] = poses[world, other, 0], poses[world, other, 1]
                 round_things[count, 2] = drone_radius
                 count += 1
-        x, y, yaw = poses[drone]
-        cast_rays(exact, segments, round_things, x, y, yaw + start, increment, range_max)
-        add_noise(exact, np.uint64(key * drones + drone), noise_std, range_min, range_max)
+        exact = np.empty(beams)
+        x, y, yaw = poses[world, drone]
+        cast_rays(
+            exact, segments[world, : segment_counts[world]], round_things, x, y, yaw + start, increment, range_max
+        )
+        key = keys[world] * np.uint64(drones) + np.uint64(drone)
+        add_noise(exact, key, noise_std, range_min, range_max)
         for beam in range(beams):
-            ranges[drone, beam] = exact[beam]
+            ranges[world, drone, beam] = exact[beam]

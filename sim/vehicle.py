@@ -10,20 +10,16 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from imagine.core.frames import rotate, wrap_angle
-from imagine.core.ned import swap_enu_ned, swap_flu_frd, swap_yaw
 from imagine.sim import vehicle_messages as build
-from imagine.sim.flight_control import AIRBORNE_M, Failsafe, FlightControl, Mode, Result, Setpoint, VehicleSettings
-from imagine.sim.vehicle_estimate import ExternalPose, VehicleEstimate, yaw_of_quaternion
+from imagine.sim.flight_control import AIRBORNE_M, Failsafe, FlightControl, Mode, Result, VehicleSettings
+from imagine.sim.vehicle_estimate import VehicleEstimate
+from imagine.sim.vehicle_inputs import read_odometry, read_setpoint
 from imagine.sim.vehicle_messages import Message
-from imagine.sim.vehicle_params import Param, from_wire, px4_params, to_wire
+from imagine.sim.vehicle_params import OFFBOARD_LOSS, TAKEOFF_HEIGHT, ParamTable
 
 AUTOPILOT_COMPONENT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
 _FORCE = 21196.0  # the magic number that forces arming or disarming
 _YAW_GAIN = 2.0  # rad/s of yaw rate per radian of heading error
-_SETPOINT_FRAMES = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_NED)  # PX4 takes no other
-_ODOMETRY_FRAMES = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_FRD)
-_IGNORE_POSITION, _IGNORE_VELOCITY = 0x007, 0x038
-_IGNORE_YAW, _IGNORE_YAW_RATE = 0x400, 0x800
 _EVERY_TICK = 0.0
 _OFF = math.inf
 _STREAMS = {  # message id -> seconds between two; ATTITUDE is always the last of its tick
@@ -58,7 +54,7 @@ class Vehicle:
         self.control = FlightControl(settings)
         self.control.height_m = height_m
         self.estimate = VehicleEstimate(yaw)
-        self.params = px4_params(settings)
+        self.params = ParamTable(settings)
         self.rejected: Counter[str] = Counter()
         self._rng = rng
         self._gyro_bias = float(rng.normal(0.0, settings.gyro_bias_std_rps))
@@ -194,40 +190,20 @@ class Vehicle:
     # -- setpoints and odometry --------------------------------------------------------------------------------------
 
     def _on_setpoint(self, m: Message, now: float) -> list[Message]:
-        mask = int(m.type_mask)
-        if m.coordinate_frame not in _SETPOINT_FRAMES:
-            self.rejected["setpoint frame"] += 1
-            return []
-        if mask & _IGNORE_POSITION != _IGNORE_POSITION or mask & _IGNORE_VELOCITY:
-            self.rejected["setpoint is not a velocity"] += 1
-            return []
-        yaw_rate = 0.0 if mask & _IGNORE_YAW_RATE else float(m.yaw_rate)
-        yaw = 0.0 if mask & _IGNORE_YAW else float(m.yaw)
-        if not all(math.isfinite(value) for value in (m.vx, m.vy, m.vz, yaw_rate, yaw)):
-            self.rejected["setpoint not finite"] += 1
-            return []
-        in_body = m.coordinate_frame == mavlink.MAV_FRAME_BODY_NED
-        vx, vy, climb = (swap_flu_frd if in_body else swap_enu_ned)(m.vx, m.vy, m.vz)
-        _, _, turn = swap_flu_frd(0.0, 0.0, yaw_rate)
-        heading = None if mask & _IGNORE_YAW else swap_yaw(yaw)
-        self.control.take_setpoint(Setpoint(vx, vy, climb, turn, heading, in_body), now)
+        setpoint = read_setpoint(m)
+        if isinstance(setpoint, str):
+            self.rejected[setpoint] += 1
+        else:
+            self.control.take_setpoint(setpoint, now)
         return []
 
     def _on_odometry(self, m: Message, now: float) -> list[Message]:
-        if m.frame_id not in _ODOMETRY_FRAMES or m.child_frame_id != mavlink.MAV_FRAME_BODY_FRD:
-            self.rejected["odometry frame"] += 1
-            return []
-        # PX4 fuses external poses only with finite variances
-        numbers = (m.x, m.y, m.z, *m.q, m.vx, m.vy, m.vz, m.pose_covariance[0], m.velocity_covariance[0])
-        if not all(math.isfinite(value) for value in numbers) or not any(m.q):
-            self.rejected["odometry not finite"] += 1
-            return []
-        x, y, _ = swap_enu_ned(m.x, m.y, m.z)  # height stays the barometer's
-        yaw = swap_yaw(yaw_of_quaternion(*m.q))
-        forward, left, _ = swap_flu_frd(m.vx, m.vy, m.vz)
-        vx, vy = rotate(yaw, forward, left)
-        self.estimate.fuse(ExternalPose(x, y, yaw, vx, vy, int(m.reset_counter)))
-        self.control.take_position(now)
+        pose = read_odometry(m)
+        if isinstance(pose, str):
+            self.rejected[pose] += 1
+        else:
+            self.estimate.fuse(pose)
+            self.control.take_position(now)
         return []
 
     # -- commands ----------------------------------------------------------------------------------------------------
@@ -297,34 +273,19 @@ class Vehicle:
 
     # -- parameters and small protocols ------------------------------------------------------------------------------
 
-    def _param_value(self, name: str) -> Message:
-        param, index = self.params[name], list(self.params).index(name)
-        return mavlink.MAVLink_param_value_message(name.encode(), to_wire(param), param.kind, len(self.params), index)
-
     def _on_param_list(self, m: Message, now: float) -> list[Message]:
-        return [self._param_value(name) for name in self.params]
+        return self.params.answer_list()
 
     def _on_param_read(self, m: Message, now: float) -> list[Message]:
-        names = list(self.params)
-        name = _param_name(m) if m.param_index < 0 else names[m.param_index] if m.param_index < len(names) else ""
-        return [self._param_value(name)] if name in self.params else []
+        return self.params.answer_read(m)
 
     def _on_param_set(self, m: Message, now: float) -> list[Message]:
-        name = _param_name(m)
-        if name not in self.params:
-            self.rejected["unknown parameter"] += 1
-            return []
-        value = from_wire(self.params[name].kind, m.param_value)
-        if value is None or m.param_type != self.params[name].kind:
-            self.rejected["parameter value"] += 1
-        else:
-            self.params[name] = Param(self.params[name].kind, value)
-            self._apply_params()
-        return [self._param_value(name)]
-
-    def _apply_params(self) -> None:
-        self.control.offboard_loss_s = max(0.1, self.params["COM_OF_LOSS_T"].value)
-        self.control.takeoff_height_m = max(AIRBORNE_M, self.params["MIS_TAKEOFF_ALT"].value)
+        answer, problem = self.params.answer_set(m)
+        if problem is not None:
+            self.rejected[problem] += 1
+        self.control.offboard_loss_s = max(0.1, self.params[OFFBOARD_LOSS])
+        self.control.takeoff_height_m = max(AIRBORNE_M, self.params[TAKEOFF_HEIGHT])
+        return answer
 
     def _on_mission_list(self, m: Message, now: float) -> list[Message]:
         return [mavlink.MAVLink_mission_count_message(m.get_srcSystem(), m.get_srcComponent(), 0, m.mission_type)]
@@ -341,8 +302,3 @@ class Vehicle:
 def _whole(value: float) -> int:
     """Return a command's parameter as the whole number it stands for; -1 when it is none."""
     return int(value) if math.isfinite(value) else -1
-
-
-def _param_name(m: Message) -> str:
-    name = m.param_id
-    return (name.decode("ascii", "replace") if isinstance(name, bytes) else str(name)).rstrip("\x00")

@@ -1,0 +1,394 @@
+"""Batched exploration: the decision process that policies are trained and evaluated in.
+
+Every tick each drone's action becomes a setpoint, passes the safety shield that also flies, moves the twin, and the
+new scans become evidence, maps over the radio, observations and reward.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from imagine.core.config import Settings
+from imagine.core.contract import ActionSpec
+from imagine.core.errors import InputError
+from imagine.core.lidar import PRESETS
+from imagine.core.mapping import MapSettings
+from imagine.core.observation import fill_motion, fill_sectors, fill_views
+from imagine.core.observation_spec import ObservationSpec
+from imagine.core.planner import plan_kernel
+from imagine.core.raster import CELL
+from imagine.core.shield import shield_kernel
+from imagine.core.vehicle_limits import VehicleLimits
+from imagine.sim.level import Level, load_level, mirrored
+from imagine.sim.team_maps import TeamMaps
+from imagine.sim.twin import TICK_S, Twin
+
+CRITIC_CHANNELS, CRITIC_CELLS = 5, 32
+_IDLE_TICKS = 30  # an episode ends when nobody has had a frontier for so long
+
+
+class ExplorationSettings(Settings):
+    """What is explored, by whom, and what a policy sees and does."""
+
+    levels: tuple[str, ...] = Field(default=("0", "1", "2", "3", "4", "5", "6"), min_length=1)
+    level_weights: tuple[float, ...] | None = Field(default=None, description="share of episodes per level")
+    worlds: int = Field(default=24, ge=1, le=4096)
+    drones: int = Field(default=3, ge=1, le=16)
+    episode_ticks: int = Field(default=1000, ge=1)
+    stop_coverage: float = Field(default=0.995, gt=0.0, le=1.0, description="an episode ends when so much is covered")
+    random_launch: bool = Field(default=True, description="start anywhere, not at the level's launch point")
+    mirror: bool = Field(default=True, description="show levels mirrored and turned as well")
+    stagger: bool = Field(default=False, description="give first episodes different lengths, so resets spread out")
+    lidar: str = "ld19"
+    map: MapSettings = MapSettings()
+    limits: VehicleLimits = VehicleLimits()
+    observation: ObservationSpec = ObservationSpec()
+    action: ActionSpec = ActionSpec()
+    protocol: Literal["off", "one-hop", "multi-hop"] = "one-hop"
+    radio_range_m: float = Field(default=5.0, gt=0.0)
+    tiles_a_tick: int = Field(
+        default=20, ge=1, description="what 250 kbit/s carries in 0.1 s at about 150 bytes a tile"
+    )
+    reward_scale: float = Field(default=5.0, gt=0.0)
+    own_credit: float = Field(default=0.5, ge=0.0, le=1.0, description="share of the reward for own discoveries")
+
+    @field_validator("lidar")
+    @classmethod
+    def _known_lidar(cls, name: str) -> str:
+        if name not in PRESETS:
+            raise ValueError(f"unknown LiDAR; known: {', '.join(PRESETS)}")
+        return name
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What policies see (`[worlds, drones, ...]`, named as ObservationSpec.shapes) and what the critic sees."""
+
+    policy: dict[str, NDArray[np.float32]]
+    critic: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class EpisodeMetrics:
+    """One finished episode. Ticks of T90 and T95 are None where never reached; distances in metres."""
+
+    world: int
+    level: str
+    ticks: int
+    coverage: float
+    curve: NDArray[np.float32]
+    t90: int | None
+    t95: int | None
+    contacts: int
+    path_m: NDArray[np.float64]
+    discovered: NDArray[np.int64]
+    tiles_sent: NDArray[np.int64]
+    overlap: float
+    """Cells known by their own sensors, summed over drones, per cell the team has seen: 1 is no overlap."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a tick brings: the next observation, reward `[worlds, drones]`, which worlds ended, their metrics."""
+
+    observation: Observation
+    reward: NDArray[np.float32]
+    done: NDArray[np.bool_]
+    episodes: list[EpisodeMetrics]
+
+
+class Exploration:
+    """A batch of worlds being explored; finished worlds start anew by themselves."""
+
+    dt = TICK_S
+
+    def __init__(self, settings: ExplorationSettings, seed: int) -> None:
+        """Load the levels and start the first episodes. Equal settings and seed give equal runs."""
+        self.settings = settings
+        self.worlds, self.drones = settings.worlds, settings.drones
+        self.lidar = PRESETS[settings.lidar]
+        self._variants = [_variants(load_level(name), settings.mirror) for name in settings.levels]
+        self._weights = _weights(settings)
+        self._generators = [np.random.default_rng([seed, world]) for world in range(self.worlds)]
+        grids = [level.grid for variants in self._variants for level in variants]
+        rows, columns = max(g[3] for g in grids), max(g[2] for g in grids)
+        self.maps = TeamMaps(self.worlds, self.drones, rows, columns)
+        first = [self._draw_level(world) for world in range(self.worlds)]
+        self.twin = Twin(first, self.drones, self.lidar, settings.limits, seed)
+        self.ticks = np.zeros(self.worlds, np.int64)
+        self._idle = np.zeros(self.worlds, np.int64)
+        self._limit = np.full(self.worlds, settings.episode_ticks)
+        self._curves: list[list[float]] = [[] for _ in range(self.worlds)]
+        self._path = np.zeros((self.worlds, self.drones))
+        self._ranges = np.empty((self.worlds, self.drones, self.lidar.beams), np.float32)
+        self._started = False
+
+    def _draw_level(self, world: int) -> Level:
+        generator = self._generators[world]
+        variants = self._variants[generator.choice(len(self._variants), p=self._weights)]
+        return variants[generator.integers(len(variants))]
+
+    def reset(self) -> Observation:
+        """Start a new episode in every world."""
+        for world in range(self.worlds):
+            self._restart(world)
+            if self.settings.stagger:
+                share = (world + 1) / self.worlds
+                self._limit[world] = max(50, round(self.settings.episode_ticks * share))
+        self._sense(np.ones(self.worlds, bool))
+        return self._observe()
+
+    def _restart(self, world: int) -> None:
+        level = self._draw_level(world)
+        generator = self._generators[world] if self.settings.random_launch else None
+        self.twin.set_level(world, level, level.launch_poses(self.drones, generator))
+        column0, row0, _, _ = level.grid
+        self.maps.clear(world, level.coverable, (column0, row0))
+        self.ticks[world] = 0
+        self._idle[world] = 0
+        self._limit[world] = self.settings.episode_ticks
+        self._curves[world] = []
+        self._path[world] = 0.0
+
+    def step(self, actions: NDArray[np.float32]) -> Step:
+        """Fly one tick with actions `[worlds, drones, action size]` in [-1, 1]."""
+        expected = (self.worlds, self.drones, self.settings.action.size)
+        if actions.shape != expected:
+            raise InputError(f"actions are {actions.shape}, expected {expected}")
+        if not np.isfinite(actions).all():
+            world, drone, _ = np.argwhere(~np.isfinite(actions))[0]
+            x, y, _ = self.twin.poses[world, drone]
+            raise InputError(
+                f"level {self.twin.levels[world].name}: the action of drone {drone} in world {world}, "
+                f"at ({x:.2f}, {y:.2f}), is not finite"
+            )
+        before = self.twin.poses[..., :2].copy()
+        self.twin.step(self._setpoints(actions))
+        self._path += np.hypot(*np.moveaxis(self.twin.poses[..., :2] - before, -1, 0))
+        self.ticks += 1
+        reward = self._reward(self._sense(np.ones(self.worlds, bool)))
+        done, episodes = self._finish()
+        return Step(self._observe(), reward, done, episodes)
+
+    def _setpoints(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
+        setpoints = np.zeros((self.worlds, self.drones, 3))
+        spec, limits, lidar = self.settings.action, self.settings.limits, self.lidar
+        _shielded_setpoints(
+            setpoints, actions.astype(np.float64), spec.mode == "body", self.settings.observation.axes == "map",
+            spec.speed_mps, spec.yaw_rate_rps, self.twin.poses, self._ranges,
+            (lidar.range_min, lidar.start, lidar.increment),
+            (limits.radius_m, limits.lag_s, limits.acceleration_mps2),
+        )  # fmt: skip
+        return setpoints
+
+    def _sense(self, active: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Scan, map and share in the `active` worlds; return the cells each drone was the first to see there."""
+        self._ranges[active] = self.twin.scan()[active]
+        lidar = self.lidar
+        return self.maps.update(
+            self._ranges,
+            self.twin.poses,
+            (lidar.start, lidar.increment, lidar.range_min, self.settings.map.range_cap_m),
+            self.links(),
+            self.settings.protocol == "multi-hop",
+            self.settings.tiles_a_tick,
+            active,
+        )
+
+    def links(self) -> NDArray[np.bool_]:
+        """Tell which drones hear which now, bool `[worlds, drones, drones]`: a disc, the diagonal left out."""
+        if self.settings.protocol == "off":
+            return np.zeros((self.worlds, self.drones, self.drones), bool)
+        positions = self.twin.poses[..., :2]
+        apart = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
+        return (apart <= self.settings.radio_range_m) & ~np.eye(self.drones, dtype=bool)
+
+    def _reward(self, gained: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Share of the level newly seen, half for the finder and half for the team (each drone's equal part)."""
+        share = gained / self.maps.coverable_cells[:, None]
+        own, team = self.settings.own_credit, 1.0 - self.settings.own_credit
+        reward = self.settings.reward_scale * (own * share + team * share.mean(axis=1, keepdims=True))
+        return reward.astype(np.float32)
+
+    def _finish(self) -> tuple[NDArray[np.bool_], list[EpisodeMetrics]]:
+        coverage = self.maps.coverage()
+        done = np.zeros(self.worlds, bool)
+        episodes = []
+        for world in range(self.worlds):
+            self._curves[world].append(float(coverage[world]))
+            busy = np.isfinite(self.maps.distance[world]).any()
+            self._idle[world] = 0 if busy else self._idle[world] + 1
+            if (
+                coverage[world] >= self.settings.stop_coverage
+                or self.ticks[world] >= self._limit[world]
+                or self._idle[world] >= _IDLE_TICKS
+            ):
+                done[world] = True
+                episodes.append(self._metrics(world))
+        for world in np.flatnonzero(done):
+            self._restart(int(world))
+        if done.any():
+            self._sense(done)  # what they see at their launch is nobody's gain
+        return done, episodes
+
+    def _metrics(self, world: int) -> EpisodeMetrics:
+        curve = np.array(self._curves[world], np.float32)
+        known = (self.maps.layers[world, range(self.drones), range(self.drones)] != 0).sum()
+        return EpisodeMetrics(
+            world=world,
+            level=self.twin.levels[world].name,
+            ticks=int(self.ticks[world]),
+            coverage=float(curve[-1]),
+            curve=curve,
+            t90=_first_at_least(curve, 0.90),
+            t95=_first_at_least(curve, 0.95),
+            contacts=int(self.twin.contacts[world].sum()),
+            path_m=self._path[world].copy(),
+            discovered=self.maps.discovered[world].copy(),
+            tiles_sent=self.maps.tiles_sent[world].copy(),
+            overlap=float(known / max(1, self.maps.seen[world].sum())),
+        )
+
+    def _observe(self) -> Observation:
+        spec, lidar = self.settings.observation, self.lidar
+        batch = (self.worlds, self.drones)
+        policy = {name: np.empty((*batch, *shape), np.float32) for name, shape in spec.shapes.items()}
+        critic = np.zeros((*batch, CRITIC_CHANNELS, CRITIC_CELLS, CRITIC_CELLS), np.float32)
+        _fill_observations(
+            policy["views"], policy["lidar"], policy["motion"], self.maps.belief, self.maps.distance,
+            self.maps.origins, self.twin.poses, self.twin.velocity, self._ranges,
+            (lidar.range_min, lidar.start, lidar.increment), np.array(spec.view_scales_m),
+            np.array(spec.frontier_ranges_m), spec.lidar_range_m, spec.speed_mps, spec.yaw_rate_rps,
+            spec.axes == "heading",
+        )  # fmt: skip
+        _fill_critic(critic, self.maps.seen, self.maps.coverable, self.maps.origins, self.twin.poses)
+        return Observation(policy, critic)
+
+    def planner_actions(self) -> NDArray[np.float32]:
+        """Return the frontier planner's action for every drone, nan where it sees no frontier to go to."""
+        actions = np.full((self.worlds, self.drones, self.settings.action.size), np.nan, np.float32)
+        lidar = self.lidar
+        for world in range(self.worlds):
+            column0, row0 = self.maps.origins[world]
+            for drone in range(self.drones):
+                x, y, yaw = self.twin.poses[world, drone]
+                ux, uy, found = plan_kernel(
+                    self.maps.distance[world, drone], self.maps.states[world, drone], column0, row0, x, y, yaw,
+                    self._ranges[world, drone], lidar.range_min, lidar.start, lidar.increment,
+                )  # fmt: skip
+                if not found:
+                    continue
+                if self.settings.action.mode == "body" or self.settings.observation.axes == "heading":
+                    c, s = math.cos(yaw), math.sin(yaw)
+                    ux, uy = c * ux + s * uy, -s * ux + c * uy
+                actions[world, drone] = (ux, uy, 0.0)[: self.settings.action.size]
+        return actions
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what decides the next episodes: the generators' states."""
+        return {"generators": [generator.bit_generator.state for generator in self._generators]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up the generators' states of an earlier run; episodes in progress start anew."""
+        for generator, saved in zip(self._generators, state["generators"], strict=True):
+            generator.bit_generator.state = saved
+
+
+def _variants(level: Level, mirror: bool) -> list[Level]:
+    if not mirror:
+        return [level]
+    flags = (False, True)
+    return [mirrored(level, swap, x, y) for swap in flags for x in flags for y in flags]
+
+
+def _weights(settings: ExplorationSettings) -> NDArray[np.float64]:
+    given: Iterable[float] = settings.level_weights or (1.0,) * len(settings.levels)
+    weights = np.array(list(given), float)
+    if len(weights) != len(settings.levels) or (weights < 0).any() or weights.sum() <= 0:
+        raise InputError("level_weights: give one weight for each of levels, none negative, not all zero")
+    return weights / weights.sum()
+
+
+def _first_at_least(curve: NDArray[np.float32], share: float) -> int | None:
+    reached = np.flatnonzero(curve >= share)
+    return int(reached[0]) + 1 if len(reached) else None
+
+
+@numba.njit(cache=True, nogil=True)
+def _shielded_setpoints(  # type: ignore[no-untyped-def]
+    setpoints, actions, body_mode, map_axes, speed, fastest_yaw, poses, ranges, lidar, limits
+):
+    """Turn actions into body velocities as `core.action` does, and pass them through the shield as in flight."""
+    range_min, start, increment = lidar
+    radius, lag, acceleration = limits
+    for world in range(actions.shape[0]):
+        for drone in range(actions.shape[1]):
+            ax = min(max(actions[world, drone, 0], -1.0), 1.0)
+            ay = min(max(actions[world, drone, 1], -1.0), 1.0)
+            rate = 0.0
+            if body_mode:
+                vx, vy = ax * speed, ay * speed
+                rate = min(max(actions[world, drone, 2], -1.0), 1.0) * fastest_yaw
+            else:
+                length = max(1.0, math.sqrt(ax * ax + ay * ay))
+                vx, vy = ax / length * speed, ay / length * speed
+                if map_axes:
+                    c, s = math.cos(poses[world, drone, 2]), math.sin(poses[world, drone, 2])
+                    vx, vy = c * vx + s * vy, -s * vx + c * vy
+            vx, vy = shield_kernel(vx, vy, ranges[world, drone], range_min, start, increment, radius, lag, acceleration)
+            setpoints[world, drone, 0], setpoints[world, drone, 1], setpoints[world, drone, 2] = vx, vy, rate
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _fill_observations(  # type: ignore[no-untyped-def]
+    views, sectors, motion, belief, distance, origins, poses, velocity, ranges, lidar, scales, frontier_ranges,
+    lidar_range, speed, fastest_yaw, heading_axes,
+):  # fmt: skip
+    range_min, start, increment = lidar
+    worlds, drones = views.shape[0], views.shape[1]
+    for index in numba.prange(worlds * drones):
+        world, drone = index // drones, index % drones
+        x, y, yaw = poses[world, drone]
+        turn = yaw if heading_axes else 0.0
+        fill_views(
+            views[world, drone], belief[world, drone], distance[world, drone], origins[world, 0], origins[world, 1],
+            x, y, turn, scales, frontier_ranges,
+        )  # fmt: skip
+        fill_sectors(sectors[world, drone], ranges[world, drone], range_min, start, increment, yaw - turn, lidar_range)
+        fill_motion(
+            motion[world, drone], velocity[world, drone, 0], velocity[world, drone, 1], velocity[world, drone, 2],
+            turn, speed, fastest_yaw,
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _fill_critic(critic, seen, coverable, origins, poses):  # type: ignore[no-untyped-def]
+    """Fill the critic's images: share unexplored, explored and not free per 0.8 m pixel, own and other drones."""
+    worlds, drones, _, side, _ = critic.shape
+    rows, columns = seen.shape[1], seen.shape[2]
+    block = max(8, math.ceil(max(rows, columns) / side))
+    for world in numba.prange(worlds):
+        for row in range(rows):
+            for column in range(columns):
+                if coverable[world, row, column]:
+                    channel = 1 if seen[world, row, column] else 0
+                    critic[world, 0, channel, row // block, column // block] += 1.0 / (block * block)
+        for i in range(side):
+            for j in range(side):
+                critic[world, 0, 2, i, j] = 1.0 - critic[world, 0, 0, i, j] - critic[world, 0, 1, i, j]
+        for drone in range(1, drones):
+            critic[world, drone, :3] = critic[world, 0, :3]
+        for drone in range(drones):
+            i = (math.floor(poses[world, drone, 1] / CELL) - origins[world, 1]) // block
+            j = (math.floor(poses[world, drone, 0] / CELL) - origins[world, 0]) // block
+            if 0 <= i < side and 0 <= j < side:
+                for viewer in range(drones):
+                    critic[world, viewer, 3 if viewer == drone else 4, i, j] = 1.0
