@@ -24,6 +24,7 @@ _UNITS_PER_M = 50.0
 _NEAR_WALL_COST = 3  # beside an obstacle a metre costs three: paths keep clear of walls where there is room
 _BUCKETS = 64  # above the longest edge, 3 * 14
 _FAR = 2**30
+_GAP = 3  # free, but too narrow to fly through
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,23 @@ def plan_states(belief, states):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def _squeezed(padded, cell, width):  # type: ignore[no-untyped-def]
+    """Tell whether obstacles lie on two opposite sides of a cell, straight or diagonal."""
+    return (
+        (padded[cell - 1] == OCCUPIED and padded[cell + 1] == OCCUPIED)
+        or (padded[cell - width] == OCCUPIED and padded[cell + width] == OCCUPIED)
+        or (padded[cell - width - 1] == OCCUPIED and padded[cell + width + 1] == OCCUPIED)
+        or (padded[cell - width + 1] == OCCUPIED and padded[cell + width - 1] == OCCUPIED)
+    )
+
+
+@numba.njit(cache=True, nogil=True)
 def _opens(padded, cell, width):  # type: ignore[no-untyped-def]
-    """Tell whether a cell is unknown with unknown beside it: lone unknown cells are not worth a flight."""
-    if padded[cell] != UNKNOWN:
+    """Tell whether a cell is unknown, with unknown beside it and no obstacles on two sides.
+
+    Lone unknown cells, and chinks in what is surely a wall, are not worth a flight.
+    """
+    if padded[cell] != UNKNOWN or _squeezed(padded, cell, width):
         return False
     return (
         padded[cell - 1] == UNKNOWN
@@ -87,6 +102,12 @@ def frontier_distances(states, distance):  # type: ignore[no-untyped-def]
                 for beside in (-width, 0, width):
                     cell = first + column + beside
                     weight[cell - 1] = weight[cell] = weight[cell + 1] = _NEAR_WALL_COST
+
+    for row in range(rows):  # a cell squeezed between obstacles is a gap of 0.2 m: nothing flies through
+        first = (row + 2) * width + 2
+        for cell in range(first, first + columns):
+            if weight[cell] > 1 and padded[cell] == FREE and _squeezed(padded, cell, width):
+                padded[cell] = _GAP
 
     heads = np.full(_BUCKETS, -1, dtype=np.int32)
     entry_cell = np.empty(9 * size + 1, dtype=np.int32)  # each settled cell relaxes at most 8 edges

@@ -54,6 +54,10 @@ LD19 = LidarSpec(beams=360)
 PRESETS: dict[str, LidarSpec] = {"ld19": LD19}
 
 
+TEAMMATE_RADIUS_M = 0.25
+"""Returns that land so near to a teammate's reported position are the teammate: its radius and both pose errors."""
+
+
 @dataclass(frozen=True)
 class Scan:
     """One turn of a LiDAR: stamp in seconds, ranges in metres, no return = inf, invalid = nan."""

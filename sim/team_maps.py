@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.frontier import frontier_distances, plan_states
+from imagine.core.lidar import TEAMMATE_RADIUS_M
 from imagine.core.raster import TILE, integrate_scan, sum_layers
-
-_TEAMMATE_RADIUS_M = 0.3
 
 
 class TeamMaps:
@@ -127,14 +126,14 @@ def _integrate_own(  # type: ignore[no-untyped-def]
         if other == drone or not connected[other]:
             continue
         dx, dy = poses[other, 0] - x, poses[other, 1] - y
-        if dx * dx + dy * dy > (range_cap + _TEAMMATE_RADIUS_M) ** 2:
+        if dx * dx + dy * dy > (range_cap + TEAMMATE_RADIUS_M) ** 2:
             continue
         for beam in range(len(kept)):
             r = kept[beam]
             if r < np.inf:
                 bearing = yaw + start + beam * increment
                 ex, ey = r * math.cos(bearing) - dx, r * math.sin(bearing) - dy
-                if ex * ex + ey * ey < _TEAMMATE_RADIUS_M * _TEAMMATE_RADIUS_M:
+                if ex * ex + ey * ey < TEAMMATE_RADIUS_M * TEAMMATE_RADIUS_M:
                     kept[beam] = np.nan
     touched = np.zeros(versions.shape, np.bool_)
     changed = integrate_scan(cells, touched, column0, row0, x, y, yaw, start, increment, kept, range_min, range_cap)

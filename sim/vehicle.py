@@ -20,6 +20,7 @@ from imagine.sim.vehicle_params import OFFBOARD_LOSS, TAKEOFF_HEIGHT, ParamTable
 AUTOPILOT_COMPONENT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
 _FORCE = 21196.0  # the magic number that forces arming or disarming
 _YAW_GAIN = 2.0  # rad/s of yaw rate per radian of heading error
+_LONGEST_INTERVAL_US = 60e6
 _EVERY_TICK = 0.0
 _OFF = math.inf
 _STREAMS = {  # message id -> seconds between two; ATTITUDE is always the last of its tick
@@ -257,7 +258,7 @@ class Vehicle:
         return Result.DENIED  # it has neither a radio control for the manual modes nor a mission
 
     def _set_interval(self, message_id: int, interval_us: float, now: float) -> Result:
-        if message_id not in self._intervals or not math.isfinite(interval_us):
+        if message_id not in self._intervals or not interval_us <= _LONGEST_INTERVAL_US:  # not a number included
             return Result.DENIED
         if interval_us < 0.0:
             self._intervals[message_id] = _OFF

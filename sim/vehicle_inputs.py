@@ -19,6 +19,7 @@ _SETPOINT_FRAMES = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_NED)  # 
 _ODOMETRY_FRAMES = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_FRD)
 _IGNORE_POSITION, _IGNORE_VELOCITY = 0x007, 0x038
 _IGNORE_YAW, _IGNORE_YAW_RATE = 0x400, 0x800
+_FARTHEST_M, _FASTEST_MPS = 1e5, 1e3  # beyond these it is no odometry but noise
 
 
 def read_setpoint(m: Message) -> Setpoint | str:
@@ -45,6 +46,8 @@ def read_odometry(m: Message) -> ExternalPose | str:
     numbers = (m.x, m.y, m.z, *m.q, m.vx, m.vy, m.vz, m.pose_covariance[0], m.velocity_covariance[0])
     if not all(math.isfinite(value) for value in numbers) or not any(m.q):
         return "odometry not finite"
+    if max(abs(m.x), abs(m.y)) > _FARTHEST_M or max(abs(m.vx), abs(m.vy)) > _FASTEST_MPS:
+        return "odometry out of bounds"
     x, y, _ = swap_enu_ned(m.x, m.y, m.z)
     yaw = swap_yaw(yaw_of_quaternion(*m.q))
     forward, left, _ = swap_flu_frd(m.vx, m.vy, m.vz)

@@ -1,0 +1,1 @@
+"""What runs on the drone: LiDAR, odometry, estimator, policy, safety, failsafe, autopilot link, runner."""

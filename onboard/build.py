@@ -1,0 +1,79 @@
+"""Putting a runner together from settings, and warming it up before it counts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from imagine.core.evidence import EvidenceMap
+from imagine.core.lidar import LidarSpec, Scan
+from imagine.mesh_comm.keys import find_key, next_boot_number
+from imagine.mesh_comm.node import MeshNode
+from imagine.mesh_comm.seal import KEY_BYTES, Sealer
+from imagine.onboard.perception import Perception
+from imagine.onboard.policy import OnnxPolicy, Policy, check_fit
+from imagine.onboard.records import FlightMode, Telemetry, TickInput
+from imagine.onboard.runner import Runner
+from imagine.onboard.settings import DroneSettings
+
+_EPOCH_S = 1_577_836_800  # 2020-01-01, where boot numbers count from
+_WARM_TICKS = 8
+
+
+def build_runner(settings: DroneSettings, policy: Policy | None, sealer: Sealer | None) -> Runner:
+    """Return a runner at its launch pose, with an empty map; `sealer` None leaves it without mesh."""
+    evidence = EvidenceMap(settings.drone_id)
+    launch = settings.launch.pose
+    evidence.cover(launch.x, launch.y, launch.x, launch.y)
+    mesh = None
+    if sealer is not None:
+        mesh = MeshNode(evidence, settings.lidar_spec, settings.map.range_cap_m, settings.radio, sealer)
+    return Runner(settings, policy, Perception(settings.lidar_spec, launch=launch), evidence, mesh)
+
+
+def load_policy(settings: DroneSettings) -> OnnxPolicy | None:
+    """Load the policy of the settings and check that it fits this drone. Raises InputError if it does not."""
+    if settings.policy is None:
+        return None
+    policy = OnnxPolicy.load(settings.policy)
+    check_fit(policy.contract, settings.lidar_spec, settings.map, settings.limits, str(settings.policy))
+    return policy
+
+
+def mesh_sealer(settings: DroneSettings, environ: Mapping[str, str], unix_time_s: float) -> Sealer | None:
+    """Return the seal of this drone's mesh messages, None without mesh. Raises InputError without a key."""
+    if settings.mesh is None:
+        return None
+    key = find_key(settings.key_file, environ)
+    if settings.boot_file is not None:
+        boot = next_boot_number(settings.boot_file, unix_time_s)
+    else:
+        boot = max(0, int(unix_time_s) - _EPOCH_S)
+    return Sealer(key, settings.drone_id, boot)
+
+
+def warm_up(settings: DroneSettings, policy: Policy | None) -> None:
+    """Run a throw-away drone through a few ticks: kernels are compiled or loaded, the model has run once.
+
+    Also worth calling once before several drones start together: the compiled kernels stay in the cache on disk.
+    """
+    mates = [
+        build_runner(settings.model_copy(update={"drone_id": number}), policy, Sealer(bytes(KEY_BYTES), number, boot=1))
+        for number in (1, 2)
+    ]
+    for number in range(_WARM_TICKS):
+        stamp = 0.1 * number
+        telemetry = Telemetry(stamp, mode=FlightMode.HOLD, position_ok=True)
+        scan = Scan(stamp, square_room(settings.lidar_spec, half_side_m=1.5 + 0.2 * number))
+        spoken: tuple[bytes, ...] = ()
+        for mate in mates:
+            spoken = mate.tick(TickInput(stamp, scan, telemetry, spoken)).datagrams
+
+
+def square_room(spec: LidarSpec, half_side_m: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    """Return the ranges seen from the middle of a square room, facing a wall, float32 `[beams]`."""
+    c, s = np.abs(np.cos(spec.bearings)), np.abs(np.sin(spec.bearings))
+    ranges = half_side_m / np.maximum(np.maximum(c, s), math.sqrt(0.5))
+    return ranges.astype(np.float32)
