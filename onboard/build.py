@@ -8,7 +8,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from imagine.core.evidence import EvidenceMap
-from imagine.core.lidar import LidarSpec, Scan
+from imagine.core.frontier import frontier_field, own_distance
+from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec, Scan, mask_near
+from imagine.core.observation import observe
+from imagine.core.observation_spec import ObservationSpec
+from imagine.core.planner import plan_velocity
+from imagine.core.shield import shield_velocity
 from imagine.mesh_comm.keys import find_key, next_boot_number
 from imagine.mesh_comm.node import MeshNode
 from imagine.mesh_comm.seal import KEY_BYTES, Sealer
@@ -70,6 +75,23 @@ def warm_up(settings: DroneSettings, policy: Policy | None) -> None:
         spoken: tuple[bytes, ...] = ()
         for mate in mates:
             spoken = mate.tick(TickInput(stamp, scan, telemetry, spoken)).datagrams
+    _rehearse_flight(settings, policy, scan, mates[0].evidence)
+
+
+def _rehearse_flight(settings: DroneSettings, policy: Policy | None, scan: Scan, evidence: EvidenceMap) -> None:
+    """Run once what only a drone in the air does: compiling it there would cost two seconds of silence."""
+    spec, pose, lidar = ObservationSpec(), settings.launch.pose, settings.lidar_spec
+    belief, origin = evidence.belief(), evidence.origin_cells
+    field = frontier_field(belief)
+    own_distance(field, origin, pose.x, pose.y)
+    plan_velocity(field, origin, pose, scan, lidar, settings.limits.speed_mps)
+    shield_velocity(0.1, 0.0, scan, lidar, settings.limits)
+    mask_near(scan.ranges, lidar, pose, np.zeros((1, 2)), TEAMMATE_RADIUS_M)
+    if policy is not None:
+        spec = policy.contract.observation
+    observation = observe(spec, belief, field, origin, pose, (0.0, 0.0), 0.0, scan, lidar)
+    if policy is not None:
+        policy.infer(observation)
 
 
 def square_room(spec: LidarSpec, half_side_m: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:

@@ -9,22 +9,26 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from imagine.core.errors import WorkError
-from imagine.core.frames import Pose
 from imagine.core.raster import CELL, LIMIT
 
 _UNKNOWN, _FREE, _OCCUPIED = 200, 255, 0
-_LINE, _START, _END = (215, 48, 39), (26, 152, 80), (33, 102, 172)
+_LINES = ((215, 48, 39), (69, 117, 180), (230, 145, 30), (118, 42, 131), (27, 120, 55), (140, 81, 10))
+_START, _END = (26, 152, 80), (33, 102, 172)
 _MARGIN_CELLS = 5
 _FOOTER_PX = 44
 _SMALLEST_PX, _LARGEST_PX = 1000, 4000
 _BAR_LENGTHS_M = (0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
-def draw_map(belief: NDArray[np.int8], origin_cells: tuple[int, int], trajectory: Sequence[Pose] = ()) -> Image.Image:
-    """Draw a belief, cropped to what is known, with north up.
+Track = Sequence[tuple[float, float]]
+"""Where a drone went: points (x, y) of the map frame, metres."""
 
-    `belief` is int8 log-odds `[rows, columns]`, its first cell at `origin_cells` (column, row) of the map frame; the
-    trajectory is in the map frame, metres. Raises WorkError where nothing is known.
+
+def draw_map(belief: NDArray[np.int8], origin_cells: tuple[int, int], tracks: Sequence[Track] = ()) -> Image.Image:
+    """Draw a belief, cropped to what is known, with north up, and a line in a colour of its own for each track.
+
+    `belief` is int8 log-odds `[rows, columns]`, its first cell at `origin_cells` (column, row) of the map frame.
+    Raises WorkError where nothing is known.
     """
     rows, columns = np.nonzero(belief)
     if len(rows) == 0:
@@ -41,12 +45,13 @@ def draw_map(belief: NDArray[np.int8], origin_cells: tuple[int, int], trajectory
 
     draw = ImageDraw.Draw(picture)
     x0, y0 = (origin_cells[0] + left) * CELL, (origin_cells[1] + top) * CELL
-    line = [((p.x - x0) / CELL * scale, height - (p.y - y0) / CELL * scale) for p in trajectory]
-    if len(line) > 1:
-        draw.line(line, fill=_LINE, width=max(2, scale // 2), joint="curve")
-    if line:
-        _dot(draw, line[-1], _END)
-        _dot(draw, line[0], _START)
+    for number, track in enumerate(tracks):
+        line = [((x - x0) / CELL * scale, height - (y - y0) / CELL * scale) for x, y in track]
+        if len(line) > 1:
+            draw.line(line, fill=_LINES[number % len(_LINES)], width=max(2, scale // 3), joint="curve")
+        if line:
+            _dot(draw, line[-1], _END)
+            _dot(draw, line[0], _START)
     _draw_scale_bar(draw, width, height, scale)
     return picture
 

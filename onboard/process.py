@@ -41,20 +41,22 @@ _RELEASED_S = 60.0
 
 
 class ScanClock:
-    """The runner's clock: the newest scan's stamp, carried on by the wall clock between scans."""
+    """The runner's clock: the newest scan's stamp, carried on by the wall clock between scans. It never runs back."""
 
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
         """Start at zero."""
         self._monotonic = monotonic
         self._stamp, self._set_at = 0.0, monotonic()
+        self._latest = 0.0
 
     def set(self, stamp: float) -> None:
         """Take a scan's stamp, seconds."""
         self._stamp, self._set_at = stamp, self._monotonic()
 
     def now(self) -> float:
-        """Return the time, seconds."""
-        return self._stamp + self._monotonic() - self._set_at
+        """Return the time, seconds; while it is ahead of a slow sensor's stamps it waits for them."""
+        self._latest = max(self._latest, self._stamp + self._monotonic() - self._set_at)
+        return self._latest
 
 
 def run_drone(settings: DroneSettings) -> int:

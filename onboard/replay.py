@@ -142,7 +142,8 @@ def replay_file(
     if json_path is not None:
         json_path.write_text(json.dumps(result.as_json(), allow_nan=False) + "\n", encoding="utf-8")
     if map_path is not None:
-        draw_map(result.evidence.belief(), result.evidence.origin_cells, result.trajectory).save(map_path, format="PNG")
+        track = [[(pose.x, pose.y) for pose in result.trajectory]]
+        draw_map(result.evidence.belief(), result.evidence.origin_cells, track).save(map_path, format="PNG")
     return result
 
 

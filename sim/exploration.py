@@ -209,14 +209,15 @@ class Exploration:
             return np.zeros((self.worlds, self.drones, self.drones), bool)
         positions = self.twin.poses[..., :2]
         apart = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
-        return (apart <= self.settings.radio_range_m) & ~np.eye(self.drones, dtype=bool)
+        linked: NDArray[np.bool_] = (apart <= self.settings.radio_range_m) & ~np.eye(self.drones, dtype=bool)
+        return linked
 
     def _reward(self, gained: NDArray[np.int64]) -> NDArray[np.float32]:
         """Share of the level newly seen, half for the finder and half for the team (each drone's equal part)."""
         share = gained / self.maps.coverable_cells[:, None]
         own, team = self.settings.own_credit, 1.0 - self.settings.own_credit
         reward = self.settings.reward_scale * (own * share + team * share.mean(axis=1, keepdims=True))
-        return reward.astype(np.float32)
+        return np.asarray(reward, np.float32)
 
     def _finish(self) -> tuple[NDArray[np.bool_], list[EpisodeMetrics]]:
         coverage = self.maps.coverage()
@@ -233,8 +234,8 @@ class Exploration:
             ):
                 done[world] = True
                 episodes.append(self._metrics(world))
-        for world in np.flatnonzero(done):
-            self._restart(int(world))
+        for ended in np.flatnonzero(done):
+            self._restart(int(ended))
         if done.any():
             self._sense(done)  # what they see at their launch is nobody's gain
         return done, episodes
@@ -314,7 +315,7 @@ def _weights(settings: ExplorationSettings) -> NDArray[np.float64]:
     weights = np.array(list(given), float)
     if len(weights) != len(settings.levels) or (weights < 0).any() or weights.sum() <= 0:
         raise InputError("level_weights: give one weight for each of levels, none negative, not all zero")
-    return weights / weights.sum()
+    return np.asarray(weights / weights.sum())
 
 
 def _first_at_least(curve: NDArray[np.float32], share: float) -> int | None:

@@ -84,7 +84,8 @@ class TeamMaps:
 
     def coverage(self) -> NDArray[np.float64]:
         """Return the share of the coverable cells that the team has seen, `[worlds]`."""
-        return self.discovered.sum(axis=1) / self.coverable_cells
+        share: NDArray[np.float64] = self.discovered.sum(axis=1) / self.coverable_cells
+        return share
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)

@@ -1,0 +1,189 @@
+"""From a checkpoint to an ONNX model with its contract inside, proven equal to the network before it is written."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+
+import imagine.train  # noqa: F401  sets up OpenMP before torch works
+from imagine.core.contract import CONTRACT_KEY, LidarContract, PolicyContract
+from imagine.core.errors import InputError, WorkError
+from imagine.core.lidar import PRESETS
+from imagine.core.observation_spec import ObservationSpec
+from imagine.onboard.onnx_weights import hash_weights
+from imagine.onboard.policy import OUTPUT, OnnxPolicy
+from imagine.train.atomic_file import write_atomically
+from imagine.train.checkpoint import Checkpoint, actor_of, load_checkpoint
+from imagine.train.networks import Actor
+from imagine.train.rollout import OBSERVATION_KEYS
+from imagine.train.run_folder import config_hash
+
+logger = logging.getLogger(__name__)
+
+PARITY_TOLERANCE = 1e-5
+PARITY_OBSERVATIONS = 256
+_OPSET = 18
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What `inspect` finds: the contract, whether the weights are those it was written for, and sizes."""
+
+    contract: PolicyContract
+    weights_sha256: str
+    file_bytes: int
+    parameters: int
+    inputs: dict[str, tuple[int, ...]]
+    outputs: dict[str, tuple[int, ...]]
+
+
+def export_onnx(checkpoint: Path, out: Path, name: str | None = None) -> Inspection:
+    """Write a checkpoint's deterministic policy to `out` and return what `inspect` finds in it.
+
+    `checkpoint` is a `.pt` file or a run folder; `name` goes into the contract (default: the run's name). The model
+    takes `views`, `lidar` and `motion` with any batch size and returns `action` `[batch, action size]`. Raises
+    InputError for a bad checkpoint, WorkError when the model does not agree with the network or cannot be written.
+    """
+    saved = load_checkpoint(checkpoint)
+    actor = actor_of(saved, str(checkpoint))
+    model = _to_onnx(actor, saved.settings.env.observation)
+    difference = parity(actor, model, saved.settings.env.observation)
+    if not difference <= PARITY_TOLERANCE:
+        raise WorkError(f"{checkpoint}: ONNX and torch differ by {difference:.2g}, at most {PARITY_TOLERANCE:g} allowed")
+    logger.info("ONNX and torch differ by at most %.2g on %d observations", difference, PARITY_OBSERVATIONS)
+
+    record = {**_training_record(saved, checkpoint), "parity_max_difference": difference}
+    contract = _contract(saved, name or saved.settings.run.name, record, hash_weights(model, str(out)))
+    content = _with_contract(model, contract)
+    write_atomically(out, lambda temporary: temporary.write_bytes(content))
+    return inspect(out)
+
+
+def _to_onnx(actor: Actor, spec: ObservationSpec) -> bytes:
+    """Return the actor as a serialised ONNX model."""
+    example = tuple(torch.zeros((2, *spec.shapes[key])) for key in OBSERVATION_KEYS)
+    batch = torch.export.Dim("batch")
+    quiet = logging.getLogger("torch.onnx")
+    level = quiet.level
+    quiet.setLevel(logging.ERROR)  # it warns of torchvision's absence
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            program = torch.onnx.export(
+                actor,
+                example,
+                input_names=list(OBSERVATION_KEYS),
+                output_names=[OUTPUT],
+                dynamic_shapes=tuple({0: batch} for _ in example),
+                opset_version=_OPSET,
+                dynamo=True,
+                verbose=False,
+            )
+    finally:
+        quiet.setLevel(level)
+    if program is None:
+        raise WorkError("torch.onnx.export returned nothing")
+    model = program.model_proto
+    graph = model.graph
+    for part in (graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        del part.metadata_props[:]  # the exporter's notes, with source lines and paths of this machine
+    content: bytes = model.SerializeToString()
+    return content
+
+
+def parity(actor: Actor, model: bytes, spec: ObservationSpec, observations: int = PARITY_OBSERVATIONS) -> float:
+    """Return the largest difference between ONNX and torch over random observations, one batch and one by one."""
+    rng = np.random.default_rng(0)
+    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    inputs: dict[str, NDArray[np.float32]] = {
+        key: rng.uniform(-1.0, 1.0, (observations, *spec.shapes[key])).astype(np.float32) for key in OBSERVATION_KEYS
+    }
+    inputs["lidar"] = np.abs(inputs["lidar"])
+    with torch.no_grad():
+        expected = actor(*(torch.from_numpy(inputs[key]) for key in OBSERVATION_KEYS)).numpy()
+    batched = session.run([OUTPUT], inputs)[0]
+    single = np.concatenate(
+        [session.run([OUTPUT], {key: value[i : i + 1] for key, value in inputs.items()})[0] for i in range(16)]
+    )
+    if batched.shape != expected.shape or not np.isfinite(batched).all():
+        return math.inf
+    return float(max(np.abs(batched - expected).max(), np.abs(single - expected[:16]).max()))
+
+
+def _contract(saved: Checkpoint, name: str, record: dict[str, Any], weights_sha256: str) -> PolicyContract:
+    env = saved.settings.env
+    lidar = PRESETS[env.lidar]
+    return PolicyContract(
+        name=name,
+        observation=env.observation,
+        action=env.action,
+        rate_hz=lidar.rate_hz,
+        lidar=LidarContract.of(lidar),
+        map=env.map,
+        limits=env.limits,
+        training=record,
+        weights_sha256=weights_sha256,
+    )
+
+
+def _training_record(saved: Checkpoint, checkpoint: Path) -> dict[str, Any]:
+    """Return how the policy was made: run, configuration, steps, commit, and how it fared where that was measured."""
+    run = checkpoint if checkpoint.is_dir() else checkpoint.parent.parent
+    record = {
+        **saved.record,
+        "config_sha256": config_hash(saved.settings),
+        "phase": saved.phase,
+        "agent_steps": saved.agent_steps,
+        "wall_s": round(saved.wall_s, 1),
+        "env": {
+            key: value
+            for key, value in saved.settings.env.model_dump(mode="json").items()
+            if key not in ("observation", "action", "map", "limits")
+        },
+    }
+    evaluation = run / "evaluation.json"
+    if evaluation.exists():
+        try:
+            record["evaluation"] = json.loads(evaluation.read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{evaluation}: cannot be read as JSON; delete it or evaluate again") from error
+    return record
+
+
+def _with_contract(model: bytes, contract: PolicyContract) -> bytes:
+    proto = onnx.load_from_string(model)
+    onnx.helper.set_model_props(proto, {CONTRACT_KEY: contract.to_json()})
+    proto.producer_name = "imagine"
+    content: bytes = proto.SerializeToString()
+    return content
+
+
+def inspect(path: Path) -> Inspection:
+    """Read a model as a drone would, and describe it. Raises InputError where a drone would refuse the file."""
+    contract = OnnxPolicy.load(path).contract
+    content = path.read_bytes()
+    graph = onnx.load_from_string(content).graph
+    return Inspection(
+        contract=contract,
+        weights_sha256=hash_weights(content, str(path)),
+        file_bytes=len(content),
+        parameters=sum(math.prod(t.dims) for t in graph.initializer if t.data_type == onnx.TensorProto.FLOAT),
+        inputs={node.name: _shape(node) for node in graph.input},
+        outputs={node.name: _shape(node) for node in graph.output},
+    )
+
+
+def _shape(node: onnx.ValueInfoProto) -> tuple[int, ...]:
+    """Return a tensor's shape without the batch axis."""
+    return tuple(dim.dim_value for dim in node.type.tensor_type.shape.dim[1:])

@@ -1,0 +1,1 @@
+"""Drone-to-drone radio: messages, sealing, byte budget, map synchronisation, UDP links."""

@@ -1,0 +1,202 @@
+"""The messages that drones and ground exchange, and their binary form: a version byte, then MessagePack.
+
+Structs travel as arrays with the tag first, so a newer sender may append fields that an older receiver ignores, and
+an older sender may leave out fields that have defaults. Units: metres, seconds, radians, map frame.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+
+from imagine.core.errors import InputError
+from imagine.core.evidence import MAX_TILES, TileKey
+from imagine.core.frames import Pose
+from imagine.core.raster import CELL, TILE
+
+MAX_DATAGRAM = 1200
+"""Largest sealed datagram, bytes: passes every link unfragmented (IPv6's smallest MTU is 1280)."""
+WIRE_VERSION = 1
+GROUND = 0
+"""Id of the ground station, which listens, shows and commands, and never writes a map."""
+POSITION_LIMIT_M = MAX_TILES * TILE * CELL / 2
+"""A position further than this from the origin cannot be in any map and is refused."""
+MAX_BEAMS = 4096
+MAX_RANGE_CAP_M = 30.0
+
+NodeId = Annotated[int, Meta(ge=0, le=254)]
+SourceId = Annotated[int, Meta(ge=1, le=254)]
+Count = Annotated[int, Meta(ge=0)]
+Clock = Annotated[int, Meta(ge=0, le=2**31)]
+Tag = Annotated[str, Meta(max_length=32)]
+Column = Annotated[int, Meta(ge=-MAX_TILES, le=MAX_TILES)]
+
+
+class Scan(Struct, tag=1, array_like=True, frozen=True):
+    """A LiDAR turn, thinned to what mapping uses: pose, beam angles, and ranges packed by `codec.pack_ranges`.
+
+    `clock` is the sender's layer clock after it had integrated this scan: a tile of that version contains it.
+    """
+
+    sender: SourceId
+    stamp: float
+    pose: Pose
+    clock: Clock
+    start: float
+    increment: float
+    beams: Annotated[int, Meta(ge=1, le=MAX_BEAMS)]
+    range_cap_m: float
+    packed: bytes
+
+
+class Tile(Struct, array_like=True, frozen=True):
+    """One tile of a source's layer: place, version, and its cells packed by `codec.pack_tile`."""
+
+    column: Column
+    row: Column
+    version: Annotated[int, Meta(ge=1, le=2**31)]
+    packed: bytes
+
+
+class Tiles(Struct, tag=2, array_like=True, frozen=True):
+    """As many tiles of one source as fit the datagram; confirmed content only."""
+
+    source: SourceId
+    tiles: Annotated[list[Tile], Meta(max_length=256)]
+
+
+class Holding(Struct, array_like=True, frozen=True):
+    """Which tiles of `source` the sender holds, among the keys in the interval (after, until] (null: unbounded).
+
+    `packed` lists the confirmed versions (`codec.pack_versions`); a key in the interval but not listed is not held.
+    """
+
+    source: SourceId
+    after: tuple[Column, Column] | None
+    until: tuple[Column, Column] | None
+    packed: bytes
+
+
+class Digest(Struct, tag=3, array_like=True, frozen=True):
+    """What the sender holds, by source; a long digest comes in several datagrams of one stamp."""
+
+    stamp: float
+    holdings: Annotated[list[Holding], Meta(max_length=256)]
+
+
+class Status(Struct, tag=4, array_like=True, frozen=True):
+    """How a drone is doing. The node fills in everything from `own_cells` on when it sends.
+
+    `velocity` in the map frame, m/s; `battery` 0..1 or null where unknown; `mode` is the autopilot's; `ladder` the
+    decision ladder's state (policy, frontier, hold, land) and `reason` why; `links` seconds since each peer was heard.
+    """
+
+    id: NodeId
+    stamp: float
+    pose: Pose
+    velocity: tuple[float, float] = (0.0, 0.0)
+    height_m: float = 0.0
+    battery: Annotated[float, Meta(ge=0.0, le=1.0)] | None = None
+    mode: Tag = ""
+    armed: bool = False
+    ladder: Tag = ""
+    reason: Annotated[str, Meta(max_length=160)] = ""
+    own_cells: Count = 0
+    scan_cells: Count = 0
+    map_cells: Count = 0
+    bytes_sent: Annotated[dict[Tag, Count], Meta(max_length=16)] = {}
+    links: Annotated[dict[NodeId, float], Meta(max_length=32)] = {}
+    rejected: Count = 0
+    last_command: Count = 0
+
+
+class Command(Struct, tag=5, array_like=True, frozen=True):
+    """An order from the ground: `action` is hold, land or resume; `target` 0 means all.
+
+    `nonce` grows with every order, so a repeated or relayed copy is obeyed once.
+    """
+
+    action: Tag
+    target: NodeId
+    nonce: Annotated[int, Meta(ge=1)]
+
+
+ACTIONS = ("hold", "land", "resume")
+
+Message = Scan | Tiles | Digest | Status | Command
+
+
+def _plain(value: object) -> object:
+    """Let numpy's scalars pass as the numbers they are."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a mesh message cannot hold {type(value).__name__}")
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
+_decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(Message)
+
+
+def encode(message: Message) -> bytes:
+    """Return a message's bytes, unsealed."""
+    return bytes((WIRE_VERSION,)) + _encoder.encode(message)
+
+
+def decode(data: bytes) -> Message:
+    """Read and check a message. Raises InputError on anything truncated, malformed, or out of bounds."""
+    if not data or data[0] != WIRE_VERSION:
+        raise InputError(f"mesh message of wire version {data[0] if data else 'none'}, expected {WIRE_VERSION}")
+    try:
+        message = _decoder.decode(memoryview(data)[1:])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"mesh message cannot be read: {error}") from error
+    _check(message)
+    return message
+
+
+def tile_key(tile: Tile) -> TileKey:
+    """Return a tile's place."""
+    return TileKey(tile.column, tile.row)
+
+
+def clip_text(text: str, limit: int) -> str:
+    """Return `text` cut to `limit` characters, so that a long reason never makes a message unreadable."""
+    return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+def _check(message: Message) -> None:
+    """Refuse what the types cannot: numbers that are not finite, poses no map can hold, orders nobody knows."""
+    match message:
+        case Scan():
+            _check_pose(message.pose)
+            turn = 2.0 * math.pi + 1e-3
+            if not (0.0 < message.increment <= turn and message.increment * message.beams <= turn):
+                raise InputError(f"mesh scan: increment {message.increment} rad with {message.beams} beams")
+            if not (abs(message.start) <= turn and 0.0 < message.range_cap_m <= MAX_RANGE_CAP_M):
+                raise InputError(f"mesh scan: start {message.start} rad, range cap {message.range_cap_m} m")
+            _check_finite("scan", message.stamp)
+        case Status():
+            _check_pose(message.pose)
+            _check_finite("status", message.stamp, *message.velocity, message.height_m, *message.links.values())
+        case Digest():
+            _check_finite("digest", message.stamp)
+        case Command():
+            if message.action not in ACTIONS:
+                raise InputError(f"mesh command '{message.action}', expected one of {', '.join(ACTIONS)}")
+        case Tiles():
+            pass  # each tile's cells are checked when they are unpacked
+
+
+def _check_finite(what: str, *values: float) -> None:
+    if not all(map(math.isfinite, values)):
+        raise InputError(f"mesh {what} holds a number that is not finite")
+
+
+def _check_pose(pose: Pose) -> None:
+    _check_finite("pose", *pose)
+    if max(abs(pose.x), abs(pose.y)) > POSITION_LIMIT_M:
+        raise InputError(f"mesh pose ({pose.x:.1f}, {pose.y:.1f}) m lies further than {POSITION_LIMIT_M:.0f} m out")

@@ -1,0 +1,310 @@
+"""A mesh node without I/O: hears datagrams, decides what to send, and keeps the evidence map in step with its peers."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter, deque
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine.core.errors import InputError
+from imagine.core.evidence import EvidenceMap
+from imagine.core.frames import Pose
+from imagine.core.lidar import LidarSpec, Scan, mask_near
+from imagine.mesh_comm import messages
+from imagine.mesh_comm.budget import TokenBucket
+from imagine.mesh_comm.digest import digests
+from imagine.mesh_comm.map_inbox import MapInbox
+from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Command, Digest, Message, Status, Tiles, tile_key
+from imagine.mesh_comm.orders import Orders
+from imagine.mesh_comm.peer_book import PeerBook
+from imagine.mesh_comm.peers import Peer, PeerRecord
+from imagine.mesh_comm.scan_exchange import scan_message
+from imagine.mesh_comm.seal import OVERHEAD, Opened, Rejected, Sealer
+from imagine.mesh_comm.settings import MeshSettings
+from imagine.mesh_comm.tile_exchange import TileExchange
+
+__all__ = ["MeshNode", "MeshSettings", "Peer"]
+
+_MAX_PAYLOAD = MAX_DATAGRAM - OVERHEAD
+_PLAN_PERIOD_S = 0.2
+_DIGEST_DATAGRAMS = 4  # of a longer digest, this many go out per period, in turn
+_EPSILON_S = 1e-6  # periods are whole ticks: rounding of their sum must not cost a tick
+_log = logging.getLogger(__name__)
+
+
+class MeshNode:
+    """One participant of the mesh: a drone, or (id 0) the ground station, which listens and commands.
+
+    All times are the caller's seconds and must not run backwards; nothing here reads a clock, waits, or draws random
+    numbers, so the same calls give the same datagrams. `bytes_sent` counts sealed bytes by kind (scan, tile, digest,
+    status; commands count as status).
+    """
+
+    def __init__(
+        self, evidence: EvidenceMap, lidar: LidarSpec, range_cap_m: float, settings: MeshSettings, sealer: Sealer
+    ) -> None:
+        """Make the node `sealer.own` that keeps `evidence` in step; `lidar` and `range_cap_m` describe its own scans.
+
+        Raises InputError if the map belongs to another id, or the range cap is beyond what a message may carry.
+        """
+        if evidence.own != sealer.own:
+            raise InputError(f"mesh node {sealer.own} was given the map of {evidence.own}")
+        if not 0.0 < range_cap_m <= messages.MAX_RANGE_CAP_M:
+            raise InputError(f"range cap is {range_cap_m} m, needs to be in (0, {messages.MAX_RANGE_CAP_M:.0f}]")
+        self.id = sealer.own
+        self.settings = settings
+        self.bytes_sent = {"scan": 0, "tile": 0, "digest": 0, "status": 0}
+        self._evidence = evidence
+        self._lidar = lidar
+        self._range_cap_m = range_cap_m
+        self._sealer = sealer
+        self._bucket = TokenBucket(settings.rate_bytes_per_s, settings.burst_bytes)
+        self._peers = PeerBook(settings)
+        self._exchange = TileExchange(evidence, settings)
+        self._maps = MapInbox(evidence, self._exchange, settings)
+        self._orders = Orders(self.id, sealer.boot, settings.command_repeat_s)
+        self._dropped: Counter[str] = Counter()
+        self._pose: Pose | None = None
+        self._status: Status | None = None
+        self._scan: messages.Scan | None = None
+        self._scan_clock = 0
+        self._digests: deque[Digest] = deque()
+        self._digest_turn = 0
+        self._next_status = self._next_digest = self._next_scan = self._next_plan = -np.inf
+        self._tiles_first = False
+
+    # --- what comes in -----------------------------------------------------------------------------------------
+
+    def receive(self, datagram: bytes, now: float) -> None:
+        """Take in whatever the radio heard. Never raises on its content: what is wrong is counted in `stats`."""
+        try:
+            opened = self._sealer.open(datagram)
+        except Rejected:
+            return  # counted by the sealer
+        if opened.sender == self.id:
+            self._dropped["own-id"] += 1  # another node runs under this id, or an earlier life of this one
+            return
+        try:
+            message = messages.decode(opened.payload)
+        except InputError as error:
+            self._drop("malformed", opened.sender, error)
+            return
+        try:
+            self._take(message, opened, datagram, now)
+        except InputError as error:
+            self._drop("content", opened.sender, error)
+
+    def _take(self, message: Message, opened: Opened, datagram: bytes, now: float) -> None:
+        sender = opened.sender
+        if isinstance(message, Command):
+            self._orders.take(message, sender, datagram)
+            return
+        if sender == GROUND and not isinstance(message, Digest):
+            raise InputError("the ground sends digests and commands only")
+        if isinstance(message, messages.Scan | Status):
+            named = message.sender if isinstance(message, messages.Scan) else message.id
+            if named != sender:
+                raise InputError(f"a message of {named}")
+        takes_maps = self.id == GROUND or self.settings.protocol != "off"
+        peer = self._peers.hear(opened, now)
+        match message:
+            case Status():
+                peer.note_status(message, now)
+            case Digest():
+                peer.note_digest(message, now, self.settings.max_sources)
+                self._maps.outgrow(max(peer.holdings.get(self.id, {}).values(), default=0))
+            case messages.Scan():
+                peer.note_pose(message.pose, message.stamp, now)
+                if takes_maps:
+                    self._maps.take_scan(message, self._not_walls(sender, now))
+            case Tiles():
+                if takes_maps:
+                    self._take_tiles(message, peer, now)
+
+    def _take_tiles(self, message: Tiles, peer: PeerRecord, now: float) -> None:
+        source = message.source
+        is_relayed = source != peer.id
+        for tile in message.tiles:
+            peer.note_held(source, tile_key(tile), tile.version)
+            if source != self.id:
+                self._exchange.note_overheard(source, tile, now)
+        if source == self.id or (is_relayed and self.settings.protocol == "one-hop" and self.id != GROUND):
+            return
+        self._maps.take_tiles(message, is_relayed and self._peers.is_live(source, now))
+
+    def _drop(self, reason: str, sender: int, error: InputError) -> None:
+        self._dropped[reason] += 1
+        _log.debug("node %d: dropped a datagram of %d: %s", self.id, sender, error)
+
+    # --- what the owner says and asks --------------------------------------------------------------------------
+
+    def offer_scan(self, scan: Scan, pose: Pose, now: float) -> None:
+        """Offer the node's own scan, taken at `pose`, for sending; call it after the scan was integrated into the map.
+
+        A scan that changed nothing, or that nobody is near to hear, is not sent. A newer scan replaces a waiting one.
+        """
+        if self.id == GROUND:
+            raise InputError("the ground station has no scans to offer")
+        self._pose = pose
+        self._maps.count_own(pose, self._range_cap_m)
+        clock = self._evidence.layers[self.id].clock
+        if now < self._next_scan - _EPSILON_S or clock == self._scan_clock or not self._peers.map_listeners(now):
+            return
+        masked = mask_near(scan.ranges, self._lidar, pose, self.teammates(now), self.settings.mask_radius_m)
+        offered = Scan(scan.stamp, masked)
+        self._scan = scan_message(self.id, clock, pose, offered, self._lidar, self._range_cap_m, _MAX_PAYLOAD)
+
+    def set_status(self, status: Status) -> None:
+        """Set what the next status message tells; cells, bytes, links, rejections and command are filled in."""
+        if status.id != self.id or self.id == GROUND:
+            raise InputError(f"status of {status.id} given to mesh node {self.id}")
+        reason = messages.clip_text(status.reason, 160)
+        mode, ladder = messages.clip_text(status.mode, 32), messages.clip_text(status.ladder, 32)
+        self._status = msgspec.structs.replace(status, reason=reason, mode=mode, ladder=ladder)
+        self._pose = status.pose
+
+    def send_command(self, action: str, target: int, now: float) -> int:
+        """Order drone `target` (0: all) to hold, land or resume; return the order's nonce.
+
+        The order is repeated for a while, and drones pass it on. Only the ground may; raises InputError otherwise.
+        """
+        return self._orders.issue(action, target, now)
+
+    def commands(self) -> list[Command]:
+        """Return the orders to this node that came since the last call, oldest first; each comes once."""
+        return self._orders.drain()
+
+    def peers(self, now: float) -> dict[int, Peer]:
+        """Return everyone ever heard, by id; `is_live` tells who was heard within the peer timeout."""
+        return self._peers.view(now)
+
+    def teammates(self, now: float, leave_out: int | None = None) -> NDArray[np.float64]:
+        """Return where live peers are by now, `[n, 2]` metres, map frame: returns there are not walls."""
+        return self._peers.positions(now, leave_out)
+
+    def _not_walls(self, scanner: int, now: float) -> NDArray[np.float64]:
+        """Return where a scan of peer `scanner` sees drones: its teammates and this one."""
+        others = self.teammates(now, leave_out=scanner)
+        return others if self._pose is None else np.vstack((others, [self._pose[:2]]))
+
+    @property
+    def own_cells(self) -> int:
+        """How many cells the node's own scans made known first."""
+        return self._maps.own_cells
+
+    @property
+    def scan_cells(self) -> int:
+        """How many cells peers' scans made known first."""
+        return self._maps.scan_cells
+
+    @property
+    def map_cells(self) -> int:
+        """How many cells tiles made known first."""
+        return self._maps.map_cells
+
+    @property
+    def stats(self) -> dict[str, int]:
+        """How many datagrams were dropped, by reason."""
+        return dict(sorted((self._sealer.rejected + self._dropped).items()))
+
+    # --- what goes out -----------------------------------------------------------------------------------------
+
+    def poll(self, now: float) -> list[bytes]:
+        """Return the datagrams to send at `now`, most urgent first, as many as the byte budget allows."""
+        out: list[bytes] = []
+        self._prepare(now)
+        steps = [self._send_commands, self._send_status, self._send_digests]
+        steps += [self._send_tiles, self._send_scan] if self._tiles_first else [self._send_scan, self._send_tiles]
+        for step in steps:
+            if not step(out, now):
+                # out of bytes; scans must not starve tiles, so whichever went short goes first next time
+                if step == self._send_tiles:
+                    self._tiles_first = True
+                elif step == self._send_scan:
+                    self._tiles_first = False
+                break
+        else:
+            self._tiles_first = False
+        return out
+
+    def _prepare(self, now: float) -> None:
+        # the ground's digest is its sign of life as well; a drone's is for drones, as the ground sends no tiles
+        has_readers = self.id == GROUND or (self.settings.protocol != "off" and self._peers.has_drone(now))
+        if has_readers and now >= self._next_digest - _EPSILON_S:
+            self._next_digest = now + self.settings.digest_period_s
+            held = {source: self._evidence.versions(source) for source in self._evidence.layers if source != self.id}
+            parts = digests(now, held, _MAX_PAYLOAD)
+            turn = self._digest_turn % len(parts)
+            self._digests = deque((parts[turn:] + parts[:turn])[:_DIGEST_DATAGRAMS])
+            self._digest_turn = turn + _DIGEST_DATAGRAMS
+        if self.id != GROUND and now >= self._next_plan - _EPSILON_S:
+            self._next_plan = now + _PLAN_PERIOD_S
+            self._exchange.plan([peer for peer in self._peers.map_listeners(now) if np.isfinite(peer.digest_at)], now)
+
+    def _send_commands(self, out: list[bytes], now: float) -> bool:
+        relays = self._orders.relays
+        while relays:
+            if not self._bucket.take(len(relays[0]), now):
+                return False
+            out.append(relays.popleft())
+            self.bytes_sent["status"] += len(out[-1])
+        for repeat in self._orders.due(now):
+            if not self._send(repeat.command, "status", out, now):
+                return False
+            self._orders.note_sent(repeat, now)
+        return True
+
+    def _send_status(self, out: list[bytes], now: float) -> bool:
+        if self._status is None or now < self._next_status - _EPSILON_S:
+            return True
+        full = msgspec.structs.replace(
+            self._status,
+            own_cells=self._maps.own_cells,
+            scan_cells=self._maps.scan_cells,
+            map_cells=self._maps.map_cells,
+            bytes_sent=dict(self.bytes_sent),
+            links=self._peers.ages(now, most=32),
+            rejected=sum(self.stats.values()),
+            last_command=self._orders.last_nonce,
+        )
+        if not self._send(full, "status", out, now):
+            return False
+        self._next_status = now + self.settings.status_period_s
+        return True
+
+    def _send_digests(self, out: list[bytes], now: float) -> bool:
+        while self._digests:
+            if not self._send(self._digests[0], "digest", out, now):
+                return False
+            self._digests.popleft()
+        return True
+
+    def _send_scan(self, out: list[bytes], now: float) -> bool:
+        if self._scan is None:
+            return True
+        if not self._send(self._scan, "scan", out, now):
+            return False
+        self._scan_clock = self._scan.clock
+        self._scan = None
+        self._next_scan = now + self.settings.scan_period_s
+        return True
+
+    def _send_tiles(self, out: list[bytes], now: float) -> bool:
+        while (message := self._exchange.next_message(_MAX_PAYLOAD)) is not None:
+            if not self._send(message, "tile", out, now):
+                return False
+            self._exchange.note_sent(message, now)
+        return True
+
+    def _send(self, message: Message, kind: str, out: list[bytes], now: float) -> bool:
+        """Seal a message and put it out if the budget allows; tell whether it did."""
+        payload = messages.encode(message)
+        size = len(payload) + OVERHEAD
+        if not self._bucket.take(size, now):
+            return False
+        out.append(self._sealer.seal(payload))
+        self.bytes_sent[kind] += size
+        return True

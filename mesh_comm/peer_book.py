@@ -1,0 +1,69 @@
+"""Everyone a node has heard, and who of them is in reach now."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine.mesh_comm.messages import GROUND
+from imagine.mesh_comm.peers import Peer, PeerRecord
+from imagine.mesh_comm.seal import Opened
+from imagine.mesh_comm.settings import MeshSettings
+
+_log = logging.getLogger(__name__)
+
+
+class PeerBook:
+    """The records of all peers by id; a peer is live when it was heard within the settings' timeout."""
+
+    def __init__(self, settings: MeshSettings) -> None:
+        """Start with nobody heard."""
+        self._settings = settings
+        self._records: dict[int, PeerRecord] = {}
+
+    def hear(self, opened: Opened, now: float) -> PeerRecord:
+        """Note that a peer was heard, and return its record."""
+        record = self._records.get(opened.sender)
+        if record is None:
+            record = self._records[opened.sender] = PeerRecord(opened.sender, opened.boot, now)
+        if record.boot != opened.boot:
+            _log.warning("mesh peer %d has restarted", opened.sender)
+            record.restart(opened.boot)
+        record.heard_at = now
+        return record
+
+    def is_live(self, id_: int, now: float) -> bool:
+        """Tell whether a peer was heard lately."""
+        record = self._records.get(id_)
+        return record is not None and now - record.heard_at <= self._settings.peer_timeout_s
+
+    def live(self, now: float) -> list[PeerRecord]:
+        """Return the records of the live peers, by id."""
+        return [record for id_, record in sorted(self._records.items()) if self.is_live(id_, now)]
+
+    def map_listeners(self, now: float) -> list[PeerRecord]:
+        """Return the live peers that take scans and tiles under the protocol: the ground always does."""
+        return [record for record in self.live(now) if record.id == GROUND or self._settings.protocol != "off"]
+
+    def has_drone(self, now: float) -> bool:
+        """Tell whether any drone is live."""
+        return any(record.id != GROUND for record in self.live(now))
+
+    def view(self, now: float) -> dict[int, Peer]:
+        """Return everyone ever heard as the outside sees them, by id."""
+        return {
+            id_: Peer(id_, max(0.0, now - r.heard_at), self.is_live(id_, now), r.pose, r.velocity, r.status)
+            for id_, r in sorted(self._records.items())
+        }
+
+    def ages(self, now: float, most: int) -> dict[int, float]:
+        """Return the seconds since each peer was heard, of the `most` heard last."""
+        latest = sorted(self._records.values(), key=lambda record: (-record.heard_at, record.id))[:most]
+        return {record.id: round(max(0.0, now - record.heard_at), 3) for record in latest}
+
+    def positions(self, now: float, leave_out: int | None = None) -> NDArray[np.float64]:
+        """Return where the live peers should be by now, `[n, 2]` metres, map frame."""
+        places = [record.position(now) for record in self.live(now) if record.id != leave_out]
+        return np.array([place for place in places if place is not None], np.float64).reshape(-1, 2)

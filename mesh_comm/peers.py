@@ -1,0 +1,107 @@
+"""What a node knows of the others: when they were heard, where they are, and which tiles they hold."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from imagine.core.errors import InputError
+from imagine.core.evidence import TileKey
+from imagine.core.frames import Pose
+from imagine.mesh_comm.codec import unpack_versions
+from imagine.mesh_comm.messages import Digest, Holding, Status
+
+_EXTRAPOLATE_S = 1.0  # a last known velocity says little about where a peer is later than this
+
+
+class Peer(NamedTuple):
+    """A peer as the outside sees it: `age_s` since it was last heard; pose and status None until told."""
+
+    id: int
+    age_s: float
+    is_live: bool
+    pose: Pose | None
+    velocity: tuple[float, float]
+    status: Status | None
+
+
+@dataclass
+class PeerRecord:
+    """Everything heard from one peer. Times are the listener's, seconds; `holdings` by source, None before a digest."""
+
+    id: int
+    boot: int
+    heard_at: float
+    pose: Pose | None = None
+    pose_stamp: float = -math.inf
+    pose_at: float = -math.inf
+    velocity: tuple[float, float] = (0.0, 0.0)
+    status: Status | None = None
+    digest_at: float = -math.inf
+    digest_stamp: float = -math.inf
+    holdings: dict[int, dict[TileKey, int]] = field(default_factory=dict)
+
+    def restart(self, boot: int) -> None:
+        """Forget what ended with the peer's restart: its clock begins anew and its map is empty."""
+        self.boot = boot
+        self.pose_stamp = self.digest_stamp = self.digest_at = -math.inf
+        self.holdings = {}
+
+    def note_pose(self, pose: Pose, stamp: float, now: float) -> None:
+        """Take a pose unless a newer one is known."""
+        if stamp >= self.pose_stamp:
+            self.pose, self.pose_stamp, self.pose_at = pose, stamp, now
+
+    def note_status(self, status: Status, now: float) -> None:
+        """Take a status unless a newer one is known."""
+        if self.status is None or status.stamp >= self.status.stamp or self.pose_stamp == -math.inf:
+            self.status, self.velocity = status, status.velocity
+        self.note_pose(status.pose, status.stamp, now)
+
+    def note_digest(self, digest: Digest, now: float, max_sources: int) -> None:
+        """Take what the peer says it holds, interval by interval; an older digest than the last is left out.
+
+        Raises InputError on a damaged list and on more than `max_sources` sources, then with nothing taken.
+        """
+        if digest.stamp < self.digest_stamp:
+            return
+        lists = [(holding, _versions(holding)) for holding in digest.holdings]
+        if len({holding.source for holding in digest.holdings} | set(self.holdings)) > max_sources + 1:
+            raise InputError(f"mesh digest of {self.id} makes more than {max_sources} sources")
+        for holding, versions in lists:
+            known = self.holdings.get(holding.source, {})
+            kept = {key: version for key, version in known.items() if not _covers(holding, key)}
+            self.holdings[holding.source] = kept | versions
+        self.digest_stamp, self.digest_at = digest.stamp, now
+
+    def note_held(self, source: int, key: TileKey, version: int) -> None:
+        """Take it that the peer holds a tile, because it sent it."""
+        tiles = self.holdings.setdefault(source, {})
+        tiles[key] = max(version, tiles.get(key, 0))
+
+    def holds(self, source: int, key: TileKey) -> int:
+        """Return the version of a tile the peer is known to hold, 0 for none."""
+        return self.holdings.get(source, {}).get(key, 0)
+
+    def hears(self, other: int, within_s: float) -> bool:
+        """Tell whether the peer, by its last status, heard node `other` within the last seconds."""
+        return self.status is not None and self.status.links.get(other, math.inf) <= within_s
+
+    def position(self, now: float) -> tuple[float, float] | None:
+        """Return where the peer should be now, by its last pose and velocity; None if never told."""
+        if self.pose is None:
+            return None
+        ahead = min(max(0.0, now - self.pose_at), _EXTRAPOLATE_S)
+        return self.pose.x + self.velocity[0] * ahead, self.pose.y + self.velocity[1] * ahead
+
+
+def _versions(holding: Holding) -> dict[TileKey, int]:
+    versions = unpack_versions(holding.packed)
+    if not all(_covers(holding, key) for key in versions):
+        raise InputError(f"mesh digest of source {holding.source} lists tiles outside its own interval")
+    return versions
+
+
+def _covers(holding: Holding, key: TileKey) -> bool:
+    return (holding.after is None or key > holding.after) and (holding.until is None or key <= holding.until)

@@ -1,0 +1,72 @@
+"""A scan on the air: packing one's own, and drawing a peer's ahead of its tiles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine.core.evidence import EvidenceMap
+from imagine.core.frames import Pose
+from imagine.core.lidar import LidarSpec, Scan, mask_near
+from imagine.core.raster import CELL, TILE
+from imagine.mesh_comm import messages
+from imagine.mesh_comm.codec import pack_ranges, unpack_ranges
+
+_SCAN_BYTES = 80  # a scan message beside its packed ranges
+
+
+def scan_message(
+    sender: int, clock: int, pose: Pose, scan: Scan, spec: LidarSpec, range_cap_m: float, max_bytes: int
+) -> messages.Scan:
+    """Return the message of a scan, at most `max_bytes` long: beams are thinned out evenly if all do not fit."""
+    stride = 1
+    while True:
+        ranges = scan.ranges[::stride]
+        packed = pack_ranges(ranges, spec.range_min, range_cap_m)
+        if len(packed) + _SCAN_BYTES <= max_bytes and len(ranges) <= messages.MAX_BEAMS:
+            increment = spec.increment * stride
+            return messages.Scan(
+                sender, scan.stamp, pose, clock, spec.start, increment, len(ranges), range_cap_m, packed
+            )
+        stride += 1
+
+
+def draw_peer_scan(
+    evidence: EvidenceMap, message: messages.Scan, teammates: NDArray[np.float64], mask_radius_m: float
+) -> None:
+    """Draw a peer's scan into its layer, except on tiles that already contain it and on teammates `[n, 2]` (metres).
+
+    Raises InputError on damaged ranges and on a pose whose surroundings no map can hold.
+    """
+    cap = message.range_cap_m
+    fov = min(message.increment * message.beams, 2.0 * math.pi)
+    spec = LidarSpec(message.beams, fov, range_min=0.0, range_max=cap + 1.0, start=message.start)
+    ranges = unpack_ranges(message.packed, message.beams, cap)
+    pose = message.pose
+    ranges = mask_near(ranges, spec, pose, teammates, mask_radius_m)
+
+    reach = cap + 2 * CELL
+    evidence.cover(pose.x - reach, pose.y - reach, pose.x + reach, pose.y + reach)
+    layer = evidence.layer(message.sender)
+    corner, side = evidence.corner, CELL * TILE
+    row0, row1 = (math.floor(y / side) - corner.row for y in (pose.y - reach, pose.y + reach))
+    column0, column1 = (math.floor(x / side) - corner.column for x in (pose.x - reach, pose.x + reach))
+    newer = [
+        (row, column)
+        for row in range(row0, row1 + 1)
+        for column in range(column0, column1 + 1)
+        if layer.versions[row, column] >= message.clock
+    ]
+    if len(newer) == (row1 - row0 + 1) * (column1 - column0 + 1):
+        return  # every tile in reach contains this scan
+    kept = [(at, layer.cells[_cells(*at)].copy(), layer.provisional[at]) for at in newer]
+    evidence.integrate_provisional(message.sender, pose, Scan(message.stamp, ranges), spec, cap)
+    for at, cells, provisional in kept:
+        layer.cells[_cells(*at)] = cells
+        layer.provisional[at] = provisional
+
+
+def _cells(row: int, column: int) -> tuple[slice, slice]:
+    return slice(row * TILE, (row + 1) * TILE), slice(column * TILE, (column + 1) * TILE)

@@ -1,0 +1,181 @@
+"""Messages and their packed parts: what goes in comes out, and anything else is refused."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imagine.core.errors import InputError
+from imagine.core.evidence import TileKey
+from imagine.core.frames import Pose
+from imagine.mesh_comm import messages
+from imagine.mesh_comm.codec import pack_ranges, pack_tile, pack_versions, unpack_ranges, unpack_tile, unpack_versions
+from imagine.mesh_comm.digest import digests
+from imagine.mesh_comm.messages import WIRE_VERSION, Command, Digest, Holding, Scan, Status, Tile, Tiles, decode, encode
+
+HERE = Pose(1.5, -2.25, 0.5)
+SAMPLES = [
+    Scan(1, 2.5, HERE, 7, 0.0, 0.0174, 360, 4.0, b"packed"),
+    Tiles(3, [Tile(-2, 5, 9, b"cells"), Tile(0, 0, 1, b"")]),
+    Digest(1.0, [Holding(1, None, (3, 4), b"a"), Holding(1, (3, 4), None, b"b")]),
+    Digest(1.0, []),
+    Status(4, 1.0, HERE, (0.5, 0.0), 1.2, 0.8, "OFFBOARD", True, "policy", "", 1, 2, 3, {"scan": 9}, {0: 0.1}, 5, 6),
+    Command("land", 0, 2**52),
+]
+
+
+@pytest.mark.parametrize("message", SAMPLES, ids=lambda m: type(m).__name__)
+def test_a_message_comes_back_equal_and_any_cut_is_refused(message: messages.Message) -> None:
+    data = encode(message)
+    assert decode(data) == message
+    for end in range(len(data)):
+        with pytest.raises(InputError):
+            decode(data[:end])
+    with pytest.raises(InputError):
+        decode(data + b"\0")
+
+
+def test_numpy_numbers_travel_as_numbers() -> None:
+    pose = Pose(np.float64(1.0), np.float32(0.5), np.float64(0.0))
+    assert decode(encode(Status(2, np.float64(0.1), pose))) == Status(2, 0.1, Pose(1.0, 0.5, 0.0))
+
+
+@settings(max_examples=300)
+@given(st.binary(max_size=200))
+def test_random_bytes_are_refused_or_read_but_nothing_else_happens(data: bytes) -> None:
+    for candidate in (data, bytes((WIRE_VERSION,)) + data):
+        try:
+            decode(candidate)
+        except InputError:
+            continue
+
+
+def wire(*fields: object) -> bytes:
+    return bytes((WIRE_VERSION,)) + msgspec.msgpack.encode(list(fields))
+
+
+def test_fields_a_newer_sender_appends_are_ignored_and_those_an_older_leaves_out_have_defaults() -> None:
+    newer = wire(5, "hold", 2, 3, "a field from the future", [1, 2])
+    assert decode(newer) == Command("hold", 2, 3)
+    older = wire(4, 1, 0.5, list(HERE))
+    assert decode(older) == Status(1, 0.5, HERE)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        wire(99, 1),
+        bytes((WIRE_VERSION + 1,)) + encode(SAMPLES[0])[1:],
+        wire(4, 1, 0.5, [float("nan"), 0.0, 0.0]),
+        wire(4, 1, float("inf"), [0.0, 0.0, 0.0]),
+        wire(4, 1, 0.5, [1e6, 0.0, 0.0]),
+        wire(4, 1, 0.5, [0.0, 0.0]),
+        wire(4, 300, 0.5, list(HERE)),
+        wire(4, 1, 0.5, list(HERE), [0.0, 0.0], 1.0, 1.5),
+        wire(5, "explode", 0, 1),
+        wire(5, "land", 0, 0),
+        wire(1, 1, 0.0, list(HERE), 1, 0.0, 0.5, 360, 4.0, b""),
+        wire(1, 1, 0.0, list(HERE), 1, 0.0, 0.01, 360, 400.0, b""),
+        wire(1, 0, 0.0, list(HERE), 1, 0.0, 0.01, 360, 4.0, b""),
+        wire(2, 1, [[5000, 0, 1, b""]]),
+        wire(2, 1, [[0, 0, 0, b""]]),
+    ],
+)
+def test_values_out_of_bounds_are_refused(data: bytes) -> None:
+    with pytest.raises(InputError):
+        decode(data)
+
+
+def test_a_long_reason_is_cut() -> None:
+    assert messages.clip_text("lost", 160) == "lost"
+    assert len(messages.clip_text("x" * 500, 160)) == 160
+
+
+ranges_m = st.lists(
+    st.one_of(st.floats(0.0, 15.0, width=32), st.sampled_from([np.inf, np.nan])), min_size=1, max_size=80
+)
+
+
+@given(ranges_m, st.sampled_from([2.0, 4.0, 12.345]))
+def test_ranges_come_back_to_half_a_centimetre(values: list[float], cap: float) -> None:
+    ranges = np.array(values, np.float32)
+    back = unpack_ranges(pack_ranges(ranges, 0.05, cap), len(ranges), cap)
+    measured = (ranges.astype(float) >= 0.05) & (ranges.astype(float) <= cap)
+    assert np.all(np.abs(back[measured].astype(float) - ranges[measured]) <= 0.0051)
+    assert np.all(back[measured] <= np.float32(cap))
+    assert np.all(np.isposinf(back) == (ranges.astype(float) > cap))
+    assert np.all(np.isnan(back) == (np.isnan(ranges) | (ranges.astype(float) < 0.05)))
+
+
+def test_a_noisy_room_scan_packs_into_less_than_a_byte_a_beam() -> None:
+    bearing = (np.arange(360) + 0.5) * 2 * np.pi / 360
+    rng = np.random.default_rng(3)
+    ranges = np.minimum(3.0 / np.abs(np.cos(bearing)), 2.5 / np.abs(np.sin(bearing))) + rng.normal(0, 0.01, 360)
+    packed = pack_ranges(ranges.astype(np.float32), 0.05, 4.0)
+    assert len(packed) < 300
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0))
+def test_a_tile_comes_back_equal(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    cells = np.where(rng.random((32, 32)) < share, rng.integers(-8, 9, (32, 32)), 0).astype(np.int8)
+    packed = pack_tile(cells)
+    assert np.array_equal(unpack_tile(packed), cells)
+    assert len(packed) < 1100  # any tile fits a datagram
+
+
+tile_keys = st.builds(TileKey, st.integers(-160, 160), st.integers(-160, 160))
+versions = st.dictionaries(tile_keys, st.integers(1, 2**31), max_size=300)
+
+
+@given(versions)
+def test_versions_come_back_equal(held: dict[TileKey, int]) -> None:
+    assert unpack_versions(pack_versions(held)) == held
+
+
+@settings(max_examples=50)
+@given(st.dictionaries(st.integers(1, 9), versions, max_size=4), st.integers(250, 1170))
+def test_digests_tell_all_versions_within_their_size(held: dict[int, dict[TileKey, int]], max_bytes: int) -> None:
+    told: dict[int, dict[TileKey, int]] = {source: {} for source in held}
+    for digest in digests(1.0, held, max_bytes):
+        assert len(encode(digest)) <= max_bytes
+        for holding in digest.holdings:
+            part = unpack_versions(holding.packed)
+            assert all(holding.after is None or key > holding.after for key in part)
+            assert all(holding.until is None or key <= holding.until for key in part)
+            told[holding.source].update(part)
+    assert told == held
+
+
+@settings(max_examples=200)
+@given(st.binary(max_size=100), st.data())
+def test_damaged_packed_bytes_are_refused(noise: bytes, data: st.DataObject) -> None:
+    good = pack_tile(np.arange(-8, 8, dtype=np.int8).repeat(64).reshape(32, 32))
+    cut = good[: data.draw(st.integers(0, len(good) - 1))]
+    for packed in (noise, cut):
+        with pytest.raises(InputError):
+            unpack_tile(packed)
+        with pytest.raises(InputError):
+            unpack_ranges(packed, 360, 4.0)
+    try:
+        unpack_versions(noise)
+    except InputError:
+        return
+
+
+def test_a_small_datagram_cannot_unpack_into_a_large_memory() -> None:
+    import zstandard
+
+    bomb = zstandard.compress(bytes(200_000_000), 19)
+    with pytest.raises(InputError):
+        unpack_tile(bomb)
+    with pytest.raises(InputError):
+        unpack_versions(bomb)
+    undeclared = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(1024))
+    with pytest.raises(InputError):
+        unpack_tile(undeclared)
+    with pytest.raises(InputError, match="beyond"):
+        unpack_tile(pack_tile(np.full((32, 32), 9, np.int8)))

@@ -1,0 +1,154 @@
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from imagine.core.errors import InputError
+from imagine.train.checkpoint import load_checkpoint
+from imagine.train.ppo import update
+from imagine.train.rollout import collect
+from imagine.train.settings import load_train_settings
+from imagine.train.trainer import Learner, Trainer, train
+
+TINY = (
+    "env.worlds=2", "env.episode_ticks=40", "env.observation.view_cells=16", "env.observation.lidar_sectors=16",
+    "imitation.agent_steps=256", "ppo.agent_steps=512", "run.threads=1",
+)  # fmt: skip
+
+
+def overrides(root, *more):
+    return (*TINY, f"run.root={root}", *more)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    root = tmp_path_factory.mktemp("runs")
+    reports = []
+    result = train(Path("smoke"), overrides(root, "run.final_episodes=1"), report=reports.append)
+    return result, reports
+
+
+def test_a_run_goes_through_both_phases_and_leaves_everything_behind(finished):
+    result, reports = finished
+    assert result.finished
+    assert [report.phase for report in reports] == ["imitation"] * 2 + ["ppo"] * 4
+    assert result.agent_steps == 256 + 512
+    assert all(np.isfinite(list(report.numbers.values())).all() for report in reports)
+    assert reports[-1].coverage > 0.1
+    rows = [json.loads(line) for line in (result.folder / "metrics.jsonl").read_text().splitlines()]
+    assert [row["agent_steps"] for row in rows] == [128 * (i + 1) for i in range(6)]
+    assert any((result.folder / "tensorboard").iterdir())
+    assert load_train_settings(result.folder / "config.yaml").env.worlds == 2
+    record = json.loads((result.folder / "record.json").read_text())
+    assert record["seed"] == 0
+    assert record["packages"]["torch"].startswith("2.")
+    assert len(record["config_sha256"]) == 64
+    assert [row["level"] for row in json.loads((result.folder / "evaluation.json").read_text())["rows"]] == ["0", "1"]
+    assert {"latest.pt", "imitated.pt", "final.pt"} <= {path.name for path in (result.folder / "checkpoints").iterdir()}
+
+
+def test_equal_seeds_give_equal_runs_and_other_seeds_others(finished, tmp_path):
+    first = load_checkpoint(finished[0].folder)
+    again = load_checkpoint(train(Path("smoke"), overrides(tmp_path)).folder)
+    other = load_checkpoint(train(Path("smoke"), overrides(tmp_path, "run.name=other", "run.seed=1")).folder)
+    assert all(torch.equal(value, again.actor[name]) for name, value in first.actor.items())
+    assert not torch.equal(first.actor["mean.weight"], other.actor["mean.weight"])
+
+
+def test_sigterm_saves_and_the_resumed_run_goes_on_from_there(tmp_path):
+    def terminate(report):
+        if report.phase == "ppo" and report.phase_steps >= 256:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    stopped = train(Path("smoke"), overrides(tmp_path), report=terminate)
+    assert not stopped.finished
+    assert stopped.agent_steps == 256 + 256
+    with (stopped.folder / "metrics.jsonl").open("a") as file:
+        file.write('{"agent_steps": 99999}\n{"cut sho')
+    reports = []
+    copy = tmp_path / "copy"
+    shutil.copytree(stopped.folder, copy)
+    resumed = train(None, resume=stopped.folder, report=reports.append)
+    assert resumed.finished
+    assert [report.agent_steps for report in reports] == [640, 768]
+    rows = [json.loads(line)["agent_steps"] for line in (resumed.folder / "metrics.jsonl").read_text().splitlines()]
+    assert rows == [128 * (i + 1) for i in range(6)]
+    train(None, resume=copy)
+    one, two = load_checkpoint(resumed.folder), load_checkpoint(copy)
+    assert all(torch.equal(value, two.actor[name]) for name, value in one.actor.items())
+    assert all(torch.equal(value, two.critic[name]) for name, value in one.critic.items())
+
+
+def test_a_restored_learner_learns_exactly_as_the_one_that_was_saved(finished):
+    checkpoint = load_checkpoint(finished[0].folder)
+    trainer = Trainer(checkpoint.settings, checkpoint)
+    rollout, _ = collect(trainer.env, trainer._observation, trainer.learner.actor, 8, trainer.learner.generator)
+    outcomes = []
+    for _ in range(2):
+        learner = Learner.create(checkpoint.settings)
+        learner.restore(checkpoint)
+        update(learner.actor, learner.critic, learner.ppo, rollout, checkpoint.settings.ppo, learner.generator)
+        outcomes.append((learner.actor.state_dict(), learner.critic.state_dict(), learner.rng.random()))
+    for first, second in zip(outcomes[0][:2], outcomes[1][:2], strict=True):
+        assert all(torch.equal(value, second[name]) for name, value in first.items())
+    assert outcomes[0][2] == outcomes[1][2]
+    assert not torch.equal(outcomes[0][0]["mean.weight"], checkpoint.actor["mean.weight"])
+
+
+def test_a_longer_run_is_asked_for_at_resume(finished, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(finished[0].folder, copy)
+    result = train(None, ("ppo.agent_steps=640", "run.final_episodes=0"), resume=copy / "checkpoints" / "final.pt")
+    assert result.agent_steps == 256 + 640
+
+
+def test_a_run_is_never_overwritten(finished, tmp_path):
+    with pytest.raises(InputError, match=r"there is a run of this name; resume it"):
+        train(Path("smoke"), overrides(finished[0].folder.parent))
+
+
+def test_resume_takes_no_second_configuration(finished):
+    with pytest.raises(InputError, match="not both"):
+        train(Path("smoke"), resume=finished[0].folder)
+
+
+def test_another_network_is_named(finished, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(finished[0].folder, copy)
+    with pytest.raises(InputError, match=r"made for another network: '.*' is \(.*\), this one needs"):
+        train(None, ("network.hidden=64",), resume=copy)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("ppo.clipp=0.2", r"unknown key 'ppo.clipp'; did you mean 'clip'"),
+        ("ppo.clip=2", r"ppo.clip: "),
+        ("run.name=../elsewhere", r"run.name: "),
+        ("env.levels=[]", r"env.levels: "),
+    ],
+)
+def test_bad_settings_are_named(tmp_path, override, message):
+    with pytest.raises(InputError, match=message):
+        train(None, overrides(tmp_path, override))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_packaged_configurations_are_valid():
+    default = load_train_settings(None)
+    assert default.env.drones == 3
+    assert set(default.env.levels) == set("0123456")
+    assert load_train_settings(Path("smoke")).ppo.agent_steps < 10_000
+
+
+def test_a_file_of_ones_own_names_its_line(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump({"run": {"name": "a"}, "ppo": {"gama": 0.9}}, sort_keys=False))
+    with pytest.raises(InputError, match=r"mine\.yaml:4: unknown key 'ppo\.gama'; did you mean 'gamma'"):
+        train(path)

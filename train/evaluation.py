@@ -1,0 +1,141 @@
+"""How well a policy explores: episodes in batches, and rows of means with bootstrap intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine.core.errors import InputError
+from imagine.sim.exploration import EpisodeMetrics, Exploration, ExplorationSettings
+from imagine.train.policies import Policy, load_policy
+
+Protocol = Literal["off", "one-hop", "multi-hop"]
+
+MAX_WORLDS = 16
+BYTES_PER_TILE = 150
+"""A tile of the evidence map on the air: compressed cells, version and seal, as measured over whole flights."""
+_RESAMPLES = 2000
+
+
+def named_policy(name: str) -> Policy | Literal["random", "frontier"]:
+    """Return a baseline by its name, or the policy in a file. Raises InputError when it is neither."""
+    if name == "random":
+        return "random"
+    if name == "frontier":
+        return "frontier"
+    path = Path(name)
+    if not path.exists():
+        raise InputError(f"{name}: no such policy: give an ONNX file, a checkpoint, a run, 'frontier' or 'random'")
+    return load_policy(path)
+
+
+def evaluate(
+    policy: Policy | Literal["random", "frontier"],
+    levels: Sequence[str],
+    drones: Sequence[int] = (3,),
+    protocol: Protocol = "one-hop",
+    episodes: int = 20,
+    seed: int = 0,
+    env: ExplorationSettings | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Fly `episodes` episodes on each level with each number of drones; return a row for each.
+
+    Drones start at the level's launch point in the level as it is drawn. `env` gives what the rows do not (episode
+    length, limits, radio); by default what the policy was made for. The deterministic policy flies. `progress` is told
+    what comes next.
+    """
+    base = env or (policy.env if isinstance(policy, Policy) else None) or ExplorationSettings()
+    rows = []
+    for level in levels:
+        for count in drones:
+            if progress is not None:
+                progress(f"level {level}, {count} drones")
+            settings = base.model_copy(
+                update={
+                    "levels": (level,), "level_weights": None, "drones": count, "protocol": protocol,
+                    "mirror": False, "random_launch": False, "stagger": False,
+                }
+            )  # fmt: skip
+            finished = run_episodes(policy, settings, episodes, seed)
+            name = policy if isinstance(policy, str) else policy.name
+            rows.append(row(name, level, count, protocol, finished, settings, seed))
+    return rows
+
+
+def run_episodes(
+    policy: Policy | Literal["random", "frontier"], settings: ExplorationSettings, episodes: int, seed: int
+) -> list[EpisodeMetrics]:
+    """Fly whole episodes in batches of worlds; each world gives one a batch, so that quick ones do not count double."""
+    finished: list[EpisodeMetrics] = []
+    batch = 0
+    while len(finished) < episodes:
+        worlds = min(MAX_WORLDS, episodes - len(finished))
+        exploration = Exploration(settings.model_copy(update={"worlds": worlds}), seed + 1000 * batch)
+        finished.extend(_first_episodes(policy, exploration, np.random.default_rng([seed, batch])))
+        batch += 1
+    return finished
+
+
+def _first_episodes(
+    policy: Policy | Literal["random", "frontier"], exploration: Exploration, rng: np.random.Generator
+) -> list[EpisodeMetrics]:
+    """Return the first finished episode of every world."""
+    observation = exploration.reset()
+    first: dict[int, EpisodeMetrics] = {}
+    shape = (exploration.worlds, exploration.drones, exploration.settings.action.size)
+    while len(first) < exploration.worlds:
+        if policy == "frontier":
+            actions = np.nan_to_num(exploration.planner_actions(), nan=0.0)
+        elif policy == "random":
+            actions = rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+        else:
+            flat = {key: np.ascontiguousarray(a.reshape(-1, *a.shape[2:])) for key, a in observation.policy.items()}
+            actions = np.clip(policy.act(flat), -1.0, 1.0).reshape(shape)
+        step = exploration.step(actions)
+        for episode in step.episodes:
+            first.setdefault(episode.world, episode)
+        observation = step.observation
+    return [first[world] for world in sorted(first)]
+
+
+def row(
+    policy: str,
+    level: str,
+    drones: int,
+    protocol: str,
+    episodes: Sequence[EpisodeMetrics],
+    settings: ExplorationSettings,
+    seed: int,
+) -> dict[str, Any]:
+    """Return the means over episodes as a row; an episode that never reaches a coverage counts with its full length."""
+    coverage = np.array([episode.coverage for episode in episodes])
+    row: dict[str, Any] = {
+        "policy": policy,
+        "level": level,
+        "drones": drones,
+        "protocol": protocol,
+        "episodes": len(episodes),
+        "coverage_mean": float(coverage.mean()),
+        "coverage_ci95": bootstrap_interval(coverage, np.random.default_rng(seed)),
+    }
+    for name in ("t90", "t95"):
+        ticks = [getattr(episode, name) for episode in episodes]
+        row[f"{name}_mean"] = float(np.mean([settings.episode_ticks if t is None else t for t in ticks]))
+        row[f"{name}_reached"] = float(np.mean([t is not None for t in ticks]))
+    row["overlap"] = float(np.mean([episode.overlap for episode in episodes]))
+    row["collisions_per_episode"] = float(np.mean([episode.contacts for episode in episodes]))
+    row["path_m"] = float(np.mean([episode.path_m.mean() for episode in episodes]))
+    row["bytes_per_drone"] = float(np.mean([BYTES_PER_TILE * episode.tiles_sent.mean() for episode in episodes]))
+    return row
+
+
+def bootstrap_interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float]:
+    """Return the 95 % percentile bootstrap interval of the mean (Efron 1979)."""
+    draws = rng.integers(0, len(values), (_RESAMPLES, len(values)))
+    low, high = np.percentile(values[draws].mean(axis=1), [2.5, 97.5])
+    return float(low), float(high)

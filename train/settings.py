@@ -1,0 +1,50 @@
+"""All settings of a training run, as its YAML file holds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field
+
+from imagine.core.config import Settings, load_settings
+from imagine.sim.exploration import ExplorationSettings
+from imagine.train.imitation import ImitationSettings
+from imagine.train.networks import NetworkSettings
+from imagine.train.ppo import PpoSettings
+
+CONFIGS = Path(__file__).parent / "configs"
+"""Folder of the configurations that come with the package: `default.yaml`, `smoke.yaml`."""
+
+
+class RunSettings(Settings):
+    """What a run is called, where it is kept, and how often it is saved."""
+
+    name: str = Field(default="default", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)
+    root: str = Field(default="runs", description="folder of run folders")
+    seed: int = Field(default=0, ge=0)
+    threads: int | None = Field(default=None, ge=1, description="of torch; none: one for each core")
+    checkpoint_every_s: float = Field(default=60.0, gt=0.0)
+    keep_checkpoints: int = Field(default=3, ge=1, description="numbered checkpoints kept beside the latest")
+    final_episodes: int = Field(default=8, ge=0, description="evaluated on each level at the end; 0: none")
+
+
+class TrainSettings(Settings):
+    """A training run: environment, networks, imitation, PPO."""
+
+    run: RunSettings = Field(default_factory=RunSettings)
+    env: ExplorationSettings = Field(default_factory=ExplorationSettings)
+    network: NetworkSettings = Field(default_factory=NetworkSettings)
+    imitation: ImitationSettings = Field(default_factory=ImitationSettings)
+    ppo: PpoSettings = Field(default_factory=PpoSettings)
+
+
+def load_train_settings(config: Path | None, overrides: tuple[str, ...] = ()) -> TrainSettings:
+    """Read a training configuration: a YAML file, the name of a packaged one (`default`, `smoke`), or None (default).
+
+    Raises InputError with file, line and key.
+    """
+    path = config or CONFIGS / "default.yaml"
+    packaged = CONFIGS / f"{path.name}.yaml"
+    if not path.exists() and path.parent == Path() and packaged.exists():
+        path = packaged
+    return load_settings(TrainSettings, path, overrides)
