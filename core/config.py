@@ -51,25 +51,31 @@ def parse_yaml(text: str, where: str) -> tuple[dict[str, Any], dict[KeyPath, int
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark else ""
-        raise InputError(f"{where}{line}: not valid YAML: {getattr(error, 'problem', None) or error}") from error
+        problem = " ".join(str(getattr(error, "problem", None) or error).split())
+        raise InputError(f"{where}{line}: not valid YAML: {problem}") from error
+    except (ValueError, RecursionError) as error:  # such as the date 2026-13-01, or a thousand brackets
+        raise InputError(f"{where}: not valid YAML: {error}") from error
     if data is None:
         return {}, {}
     if not isinstance(data, dict):
         raise InputError(f"{where}:1: expected keys and values, found {type(data).__name__}")
     lines: dict[KeyPath, int] = {}
-    _collect_lines(node, (), lines)
+    _collect_lines(node, (), lines, set())
     return data, lines
 
 
-def _collect_lines(node: yaml.Node | None, at: KeyPath, lines: dict[KeyPath, int]) -> None:
+def _collect_lines(node: yaml.Node | None, at: KeyPath, lines: dict[KeyPath, int], visited: set[int]) -> None:
+    if id(node) in visited:
+        return  # an alias: what it stands for is noted where it was written, and may hold the alias itself
+    visited.add(id(node))
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
             lines[(*at, key.value)] = key.start_mark.line + 1
-            _collect_lines(value, (*at, key.value), lines)
+            _collect_lines(value, (*at, key.value), lines, visited)
     elif isinstance(node, yaml.SequenceNode):
         for index, value in enumerate(node.value):
             lines[(*at, index)] = value.start_mark.line + 1
-            _collect_lines(value, (*at, index), lines)
+            _collect_lines(value, (*at, index), lines, visited)
 
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -81,8 +87,8 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> dict[str,
             raise InputError(f"--set {override}: expected key=value, for example --set ppo.lr=1e-4")
         try:
             value = yaml.safe_load(raw)
-        except yaml.YAMLError as error:
-            raise InputError(f"--set {override}: the value is not valid YAML") from error
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            raise InputError(f"--set {override:.80}: the value is not valid YAML") from error
         if isinstance(value, str):
             value = _number(value)
         target = merged

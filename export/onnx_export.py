@@ -60,7 +60,9 @@ def export_onnx(checkpoint: Path, out: Path, name: str | None = None) -> Inspect
     model = _to_onnx(actor, saved.settings.env.observation)
     difference = parity(actor, model, saved.settings.env.observation)
     if not difference <= PARITY_TOLERANCE:
-        raise WorkError(f"{checkpoint}: ONNX and torch differ by {difference:.2g}, at most {PARITY_TOLERANCE:g} allowed")
+        raise WorkError(
+            f"{checkpoint}: ONNX and torch differ by {difference:.2g}, at most {PARITY_TOLERANCE:g} allowed"
+        )
     logger.info("ONNX and torch differ by at most %.2g on %d observations", difference, PARITY_OBSERVATIONS)
 
     record = {**_training_record(saved, checkpoint), "parity_max_difference": difference}

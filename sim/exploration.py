@@ -110,9 +110,13 @@ class Exploration:
 
     dt = TICK_S
 
-    def __init__(self, settings: ExplorationSettings, seed: int) -> None:
-        """Load the levels and start the first episodes. Equal settings and seed give equal runs."""
+    def __init__(self, settings: ExplorationSettings, seed: int, restart: bool = True) -> None:
+        """Load the levels and start the first episodes. Equal settings and seed give equal runs.
+
+        Without `restart` a finished world stays as it ended until `reset`.
+        """
         self.settings = settings
+        self._restarts = restart
         self.worlds, self.drones = settings.worlds, settings.drones
         self.lidar = PRESETS[settings.lidar]
         self._variants = [_variants(load_level(name), settings.mirror) for name in settings.levels]
@@ -120,9 +124,9 @@ class Exploration:
         self._generators = [np.random.default_rng([seed, world]) for world in range(self.worlds)]
         grids = [level.grid for variants in self._variants for level in variants]
         rows, columns = max(g[3] for g in grids), max(g[2] for g in grids)
-        self.maps = TeamMaps(self.worlds, self.drones, rows, columns)
         first = [self._draw_level(world) for world in range(self.worlds)]
         self.twin = Twin(first, self.drones, self.lidar, settings.limits, seed)
+        self.maps = TeamMaps(self.worlds, self.drones, rows, columns, self.twin.workers)
         self.ticks = np.zeros(self.worlds, np.int64)
         self._idle = np.zeros(self.worlds, np.int64)
         self._limit = np.full(self.worlds, settings.episode_ticks)
@@ -234,6 +238,8 @@ class Exploration:
             ):
                 done[world] = True
                 episodes.append(self._metrics(world))
+        if not self._restarts:
+            return done, episodes
         for ended in np.flatnonzero(done):
             self._restart(int(ended))
         if done.any():
@@ -263,14 +269,17 @@ class Exploration:
         batch = (self.worlds, self.drones)
         policy = {name: np.empty((*batch, *shape), np.float32) for name, shape in spec.shapes.items()}
         critic = np.zeros((*batch, CRITIC_CHANNELS, CRITIC_CELLS, CRITIC_CELLS), np.float32)
-        _fill_observations(
-            policy["views"], policy["lidar"], policy["motion"], self.maps.belief, self.maps.distance,
-            self.maps.origins, self.twin.poses, self.twin.velocity, self._ranges,
+        workers = self.twin.workers
+        workers.over(
+            self.worlds, _fill_observations, policy["views"], policy["lidar"], policy["motion"],
+            self.maps.belief, self.maps.distance, self.maps.origins, self.twin.poses, self.twin.velocity, self._ranges,
             (lidar.range_min, lidar.start, lidar.increment), np.array(spec.view_scales_m),
             np.array(spec.frontier_ranges_m), spec.lidar_range_m, spec.speed_mps, spec.yaw_rate_rps,
             spec.axes == "heading",
         )  # fmt: skip
-        _fill_critic(critic, self.maps.seen, self.maps.coverable, self.maps.origins, self.twin.poses)
+        workers.over(
+            self.worlds, _fill_critic, critic, self.maps.seen, self.maps.coverable, self.maps.origins, self.twin.poses
+        )
         return Observation(policy, critic)
 
     def planner_actions(self) -> NDArray[np.float32]:
@@ -348,14 +357,14 @@ def _shielded_setpoints(  # type: ignore[no-untyped-def]
             setpoints[world, drone, 0], setpoints[world, drone, 1], setpoints[world, drone, 2] = vx, vy, rate
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _fill_observations(  # type: ignore[no-untyped-def]
-    views, sectors, motion, belief, distance, origins, poses, velocity, ranges, lidar, scales, frontier_ranges,
-    lidar_range, speed, fastest_yaw, heading_axes,
+    first, last, views, sectors, motion, belief, distance, origins, poses, velocity, ranges, lidar, scales,
+    frontier_ranges, lidar_range, speed, fastest_yaw, heading_axes,
 ):  # fmt: skip
     range_min, start, increment = lidar
-    worlds, drones = views.shape[0], views.shape[1]
-    for index in numba.prange(worlds * drones):
+    drones = views.shape[1]
+    for index in range(first * drones, last * drones):
         world, drone = index // drones, index % drones
         x, y, yaw = poses[world, drone]
         turn = yaw if heading_axes else 0.0
@@ -370,13 +379,13 @@ def _fill_observations(  # type: ignore[no-untyped-def]
         )  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _fill_critic(critic, seen, coverable, origins, poses):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, nogil=True)
+def _fill_critic(first, last, critic, seen, coverable, origins, poses):  # type: ignore[no-untyped-def]
     """Fill the critic's images: share unexplored, explored and not free per 0.8 m pixel, own and other drones."""
-    worlds, drones, _, side, _ = critic.shape
+    _, drones, _, side, _ = critic.shape
     rows, columns = seen.shape[1], seen.shape[2]
     block = max(8, math.ceil(max(rows, columns) / side))
-    for world in numba.prange(worlds):
+    for world in range(first, last):
         for row in range(rows):
             for column in range(columns):
                 if coverable[world, row, column]:

@@ -10,7 +10,7 @@ import numpy as np
 _TWO_PI = 2.0 * math.pi
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def cast_rays(ranges, segments, circles, x, y, heading, increment, range_max):  # type: ignore[no-untyped-def]
     """Fill `ranges` (float64 `[beams]`) with the distance to the first hit, inf beyond `range_max`.
 
@@ -76,7 +76,7 @@ def cast_rays(ranges, segments, circles, x, y, heading, increment, range_max):  
             ranges[beam] = np.inf
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mix(value):  # type: ignore[no-untyped-def]
     """Scramble 64 bits (the finaliser of splitmix64, Steele et al. 2014)."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -84,7 +84,7 @@ def _mix(value):  # type: ignore[no-untyped-def]
     return value ^ (value >> np.uint64(31))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def add_noise(ranges, key, noise_std, range_min, range_max):  # type: ignore[no-untyped-def]
     """Add Gaussian noise to finite ranges (metres), in place; what falls below `range_min` turns invalid (nan).
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from imagine.core.frontier import frontier_distances, plan_states
 from imagine.core.lidar import TEAMMATE_RADIUS_M
 from imagine.core.raster import TILE, integrate_scan, sum_layers
+from imagine.sim.workers import Workers
 
 
 class TeamMaps:
@@ -25,8 +26,9 @@ class TeamMaps:
     `[worlds, rows, columns]` is what the team has ever known, `discovered` counts the cells each drone saw first.
     """
 
-    def __init__(self, worlds: int, drones: int, rows: int, columns: int) -> None:
+    def __init__(self, worlds: int, drones: int, rows: int, columns: int, workers: Workers | None = None) -> None:
         """Make empty maps; rows and columns are whole tiles."""
+        self._workers = workers or Workers()
         tiles = rows // TILE, columns // TILE
         self.layers = np.zeros((worlds, drones, drones, rows, columns), np.int8)
         self.versions = np.zeros((worlds, drones, drones, *tiles), np.uint32)
@@ -74,10 +76,10 @@ class TeamMaps:
         gained = np.zeros(self.discovered.shape, np.int64)
         if active is None:
             active = np.ones(len(gained), np.bool_)
-        _update(
-            self.layers, self.versions, self.clocks, self.belief, self.distance, self.states, self.seen,
-            self.coverable, self.origins, self.extents, self.tiles_sent, gained, ranges, poses, lidar, connected,
-            relays, tiles_a_tick, active,
+        self._workers.over(
+            len(gained), _update, self.layers, self.versions, self.clocks, self.belief, self.distance, self.states,
+            self.seen, self.coverable, self.origins, self.extents, self.tiles_sent, gained, ranges, poses, lidar,
+            connected, relays, tiles_a_tick, active,
         )  # fmt: skip
         self.discovered += gained
         return gained
@@ -88,13 +90,13 @@ class TeamMaps:
         return share
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _update(  # type: ignore[no-untyped-def]
-    layers, versions, clocks, belief, distance, states, seen, coverable, origins, extents, tiles_sent, gained,
-    ranges, poses, lidar, connected, relays, tiles_a_tick, active,
+    first, last, layers, versions, clocks, belief, distance, states, seen, coverable, origins, extents, tiles_sent,
+    gained, ranges, poses, lidar, connected, relays, tiles_a_tick, active,
 ):  # fmt: skip
-    worlds, drones = clocks.shape
-    for world in numba.prange(worlds):
+    drones = clocks.shape[1]
+    for world in range(first, last):
         if not active[world]:
             continue
         column0, row0 = origins[world]

@@ -21,6 +21,7 @@ from imagine.core.lidar import LD19, LidarSpec
 from imagine.core.vehicle_limits import VehicleLimits
 from imagine.sim.level import Level
 from imagine.sim.rays import add_noise, cast_rays
+from imagine.sim.workers import Workers
 
 TICK_S = 0.1
 """Simulated time of one step: one LiDAR turn."""
@@ -64,6 +65,7 @@ class Twin:
         self.limits = limits or VehicleLimits()
         self.seed = seed
         self.ticks = 0
+        self.workers = Workers()
         self.poses = np.zeros((self.worlds, drones, 3))
         self.velocity = np.zeros((self.worlds, drones, 3))
         self.contacts = np.zeros((self.worlds, drones), np.int64)
@@ -184,15 +186,16 @@ class Twin:
             self._geometry = _stack([level.segments for level in self.levels], [lv.circles for lv in self.levels])
         segments, segment_counts, circles, circle_counts = self._geometry
         lidar = self.lidar
-        _scan_worlds(
-            ranges, segments, segment_counts, circles, circle_counts, self.poses, self.limits.radius_m,
-            (lidar.start, lidar.increment, lidar.range_min, lidar.range_max, lidar.noise_std), keys,
+        self.workers.over(
+            self.worlds, _scan_worlds, ranges, segments, segment_counts, circles, circle_counts, self.poses,
+            self.limits.radius_m, (lidar.start, lidar.increment, lidar.range_min, lidar.range_max, lidar.noise_std),
+            keys,
         )  # fmt: skip
         return ranges
 
     def noise_key(self, world: int) -> int:
         """Return the number that this tick's sensor noise of a world is drawn from."""
-        return (self.seed * 1_000_003 + world) * 1_000_003 + self.ticks
+        return ((self.seed * 1_000_003 + world) * 1_000_003 + self.ticks) % 2**64
 
 
 def _stack(segments: list[NDArray[np.float64]], circles: list[NDArray[np.float64]]) -> _Geometry:
@@ -227,18 +230,23 @@ def _control(forces, velocity, yaw, wanted, dt, lag, acceleration, speed, fastes
         yaw[k] += velocity[k, 2] * dt
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _scan_worlds(  # type: ignore[no-untyped-def]
-    ranges, segments, segment_counts, circles, circle_counts, poses, drone_radius, lidar, keys
+    first, last, ranges, segments, segment_counts, circles, circle_counts, poses, drone_radius, lidar, keys
 ):
-    """Fill `ranges` (float32 `[worlds, drones, beams]`): level, other drones, and noise drawn from the world's key."""
+    """Fill `ranges` (float32 `[worlds, drones, beams]`) of worlds first to last.
+
+    They see the level, the other drones, and noise drawn from the world's key.
+    """
     start, increment, range_min, range_max, noise_std = lidar
-    worlds, drones, beams = ranges.shape
-    for index in numba.prange(worlds * drones):
+    _, drones, beams = ranges.shape
+    for index in range(first * drones, last * drones):
         world, drone = index // drones, index % drones
         posts = circle_counts[world]
         round_things = np.empty((posts + drones - 1, 3))
-        round_things[:posts] = circles[world, :posts]
+        for post in range(posts):
+            for k in range(3):
+                round_things[post, k] = circles[world, post, k]
         count = posts
         for other in range(drones):
             if other != drone:

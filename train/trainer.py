@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from imagine.core.errors import InputError
-from imagine.sim.exploration import Exploration, Observation
+from imagine.sim.exploration import Exploration
 from imagine.train.atomic_file import write_atomically
 from imagine.train.checkpoint import Checkpoint, Phase, load_checkpoint, load_weights
 from imagine.train.evaluation import evaluate

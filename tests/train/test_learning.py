@@ -40,11 +40,11 @@ def test_ppo_learns_what_pays_and_what_it_is_worth():
     first = rollout_that_pays_for_going_east(actor, generator)
     before = actor(*(first.last[key] for key in OBSERVATION_KEYS)).detach()
     losses = [update(actor, critic, optimisers, first, PPO, generator)["value_loss"]]
-    for _ in range(15):
+    for _ in range(8):
         rollout = rollout_that_pays_for_going_east(actor, generator)
         losses.append(update(actor, critic, optimisers, rollout, PPO, generator)["value_loss"])
     after = actor(*(first.last[key] for key in OBSERVATION_KEYS)).detach()
-    assert (after - before)[:, 0].mean() > 0.1
+    assert (after - before)[:, 0].mean() > 0.05
     assert abs((after - before)[:, 1].mean()) < (after - before)[:, 0].mean() / 2
     assert losses[-1] < losses[0]
 

@@ -1,0 +1,15 @@
+import imagine.train  # sets up OpenMP, so it comes before torch  # isort: skip
+
+import pytest
+import torch
+
+assert imagine.train
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Small networks are quickest on one thread, above all beside other work."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
