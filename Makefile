@@ -20,7 +20,7 @@ lint: $(VENV)/.developer
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -q --no-header --durations=0 tests/imagine/test_floors.py
+	$(BIN)/python -m pytest -q --no-header --durations=0 tests/command/test_floors.py
 
 format: $(VENV)/.developer
 	$(BIN)/ruff check --fix .

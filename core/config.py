@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +22,9 @@ class Settings(BaseModel):
 
 S = TypeVar("S", bound=BaseModel)
 KeyPath = tuple[str | int, ...]
+
+_SHORT = reprlib.Repr()  # stops early: a few lines of YAML with aliases can stand for millions of values
+_SHORT.maxstring = _SHORT.maxother = 80
 
 
 def load_settings(model: type[S], path: Path | None, overrides: Sequence[str] = ()) -> S:
@@ -125,7 +129,7 @@ def check_settings(model: type[S], data: dict[str, Any], where: str, lines: dict
             raise InputError(f"{place}: key '{key}' is missing") from error
         got = first.get("input")
         message = first["msg"].removeprefix("Value error, ")
-        raise InputError(f"{place}: {key}: {message} (got {got!r:.80})") from error
+        raise InputError(f"{place}: {key}: {message} (got {_SHORT.repr(got):.80})") from error
 
 
 def _line_of(location: KeyPath, lines: dict[KeyPath, int]) -> int | None:

@@ -83,8 +83,9 @@ class PolicyContract(Settings):
         """Read a contract; `where` names the model in errors. Raises InputError naming the field that does not fit."""
         try:
             data = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise InputError(f"{where}: its contract is not valid JSON (character {error.pos})") from error
+        except (ValueError, RecursionError) as error:  # broken, or numbers or nesting past all measure
+            place = f" (character {error.pos})" if isinstance(error, json.JSONDecodeError) else ""
+            raise InputError(f"{where}: its contract is not valid JSON{place}") from error
         if not isinstance(data, dict):
             raise InputError(f"{where}: its contract is not a JSON object")
         return check_settings(PolicyContract, data, where=f"{where}: contract")

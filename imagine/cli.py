@@ -11,16 +11,20 @@ import logging
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
 
-import click
 import typer
 
 from imagine import __version__
 from imagine.core.errors import ImagineError, InputError
-from imagine.mesh_comm.settings import Protocol
+from imagine.outputs import check_outputs
 
+if TYPE_CHECKING:  # a command imports what it runs when it runs, so that each starts fast
+    from imagine.mesh_comm.settings import Protocol
+
+_INTERRUPTED = 130
 _BEGAN = time.monotonic()
+_UsageError: type[Any] = typer.BadParameter.__mro__[1]  # click's, or that of the copy of click in newer typers
 
 app = typer.Typer(
     name="imagine",
@@ -34,6 +38,9 @@ app = typer.Typer(
 export_app = typer.Typer(help="Turn checkpoints into models that fly.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(export_app, name="export")
 
+_SIM_FLAGS = {"level", "drones", "ticks", "speed", "headless", "seed", "port", "map_file", "lockstep"}
+_DRONE_FLAGS = {"vehicle", "lidar", "mesh", "config", "overrides"}
+
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="write the results here as JSON")]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="override a setting; may be given many times")
@@ -46,15 +53,17 @@ def main() -> None:
     try:
         status = app(standalone_mode=False)
     except ImagineError as error:
-        print(f"imagine: {error}", file=sys.stderr)
+        print(f"imagine: {' '.join(str(error).split())}", file=sys.stderr)  # one line, whatever is quoted in it
         status = error.exit_status
-    except click.UsageError as error:
+    except _UsageError as error:
         command = error.ctx.command_path if error.ctx is not None else "imagine"
-        print(f"imagine: {error.format_message().rstrip('.')}; see {command} --help", file=sys.stderr)
+        said = " ".join(error.format_message().split()).rstrip(".")
+        print(f"imagine: {said}; see {command} --help", file=sys.stderr)
         status = 2
-    except (KeyboardInterrupt, click.Abort):
+    except (KeyboardInterrupt, typer.Abort):
+        status = _INTERRUPTED
+    if status == _INTERRUPTED:  # which is also what typer makes of KeyboardInterrupt
         print("imagine: interrupted", file=sys.stderr)
-        status = 130
     sys.exit(status if isinstance(status, int) else 0)
 
 
@@ -72,11 +81,12 @@ def _top(
 
 @app.command()
 def fly(
+    context: typer.Context,
     sim: Annotated[bool, typer.Option("--sim", help="fly in the twin: all drones on this machine")] = False,
     level: Annotated[str, typer.Option(help="with --sim: a level, 0 to 6, or a YAML file")] = "4",
     drones: Annotated[int, typer.Option(min=1, max=16, help="with --sim: how many drones")] = 3,
     policy: Annotated[str | None, typer.Option(help="ONNX file, or 'frontier' for the planner alone")] = None,
-    protocol: Annotated[str, typer.Option(help="off, one-hop or multi-hop")] = "one-hop",
+    protocol: Annotated[str | None, typer.Option(help="off, one-hop (the default) or multi-hop")] = None,
     ticks: Annotated[int, typer.Option(min=1, help="with --sim: fly so long at most, in tenths of a second")] = 1000,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="repeatable, as fast as the machine")] = False,
     speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="simulated seconds per second")] = 1.0,
@@ -94,18 +104,26 @@ def fly(
     """Fly the team: with --sim in the twin on this machine, with --vehicle one real (or served) drone."""
     if sim == (vehicle is not None or config is not None):
         raise InputError("fly: give --sim to fly in the twin, or --vehicle URL and --lidar URL on a drone")
+    check_outputs(json_file, map_file)
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+    for name in sorted(given & (_DRONE_FLAGS if sim else _SIM_FLAGS)):
+        flag = {"map_file": "--map", "overrides": "--set"}.get(name, f"--{name}")
+        why = "is for a drone of its own; --sim wires its drones itself" if sim else "goes with --sim"
+        raise InputError(f"fly: {flag} {why}")
     if not sim:
-        _fly_vehicle(vehicle, lidar, mesh, policy, _protocol(protocol), config, overrides or [], json_file)
+        _fly_vehicle(vehicle, lidar, mesh, policy, protocol, config, overrides or [], json_file)
         return
-    for flag, value in (("--lidar", lidar), ("--mesh", mesh), ("--set", overrides)):
-        if value:
-            raise InputError(f"{flag} is for a drone of its own; --sim wires its drones itself")
-    from imagine.fly_command import fly_in_twin
+    from imagine.runner_processes import RunnerProcesses
 
-    fly_in_twin(
-        _BEGAN, level=level, drones=drones, policy=policy, protocol=_protocol(protocol), ticks=ticks, lockstep=lockstep,
-        speed=speed, headless=headless, seed=seed, port=port, map_file=map_file, json_file=json_file,
-    )  # fmt: skip
+    with RunnerProcesses(drones) as processes:  # they load their code while this process loads its own
+        from imagine.fly_command import fly_in_twin
+
+        fly_in_twin(
+            processes, _BEGAN, level=level, drones=drones, policy=policy, protocol=_protocol(protocol or "one-hop"),
+            ticks=ticks, lockstep=lockstep, speed=speed, headless=headless, seed=seed, port=port,
+            map_file=map_file, json_file=json_file,
+        )  # fmt: skip
 
 
 def _fly_vehicle(
@@ -113,7 +131,7 @@ def _fly_vehicle(
     lidar: str | None,
     mesh: str | None,
     policy: str | None,
-    protocol: Protocol,
+    protocol: str | None,
     config: Path | None,
     overrides: list[str],
     json_file: Path | None,
@@ -126,12 +144,39 @@ def _fly_vehicle(
     flags = [f"{key}={json.dumps(str(value))}" for key, value in given.items() if value is not None]
     if policy is not None:
         flags.append("policy=null" if policy == "frontier" else f"policy={json.dumps(policy)}")
-    if config is None:
-        flags.append(f"radio.protocol={protocol}")
+    if protocol is not None:
+        flags.append(f"radio.protocol={_protocol(protocol)}")
     logging.getLogger().setLevel(logging.INFO)
     status = run_drone(load_settings(DroneSettings, config, [*flags, *overrides]))
     if status:
         raise typer.Exit(status)
+
+
+@app.command()
+def sim(
+    level: Annotated[str, typer.Option(help="a level, 0 to 6, or a YAML file")] = "4",
+    drones: Annotated[int, typer.Option(min=1, max=16)] = 3,
+    base_port: Annotated[
+        int, typer.Option(min=1024, max=60000, help="drone i is at this + i, its LiDAR 1000 and its radio 2000 above")
+    ] = 14540,
+    host: Annotated[str, typer.Option(help="address the twin listens on")] = "127.0.0.1",
+    runners: Annotated[str, typer.Option(metavar="HOST", help="address of the runners")] = "127.0.0.1",
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="wait for every runner's setpoint")] = False,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="simulated seconds per second")] = 1.0,
+    mesh: Annotated[bool, typer.Option(help="give each drone a radio modem")] = True,
+    ticks: Annotated[int, typer.Option(min=0, help="serve so long, in tenths of a second; 0: until stopped")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="of sensors, radio and vehicles")] = 0,
+    wait: Annotated[float, typer.Option(min=0.1, help="seconds for the runners to connect")] = 600.0,
+) -> None:
+    """Serve the twin (vehicles, LiDARs, radio) for runners elsewhere: hardware in the loop."""
+    from imagine.sim_command import ServeOptions, serve_twin
+
+    serve_twin(
+        ServeOptions(
+            level=level, drones=drones, base_port=base_port, host=host, runner_host=runners, lockstep=lockstep,
+            speed=speed, mesh=mesh, ticks=ticks, seed=seed, wait_s=wait,
+        )
+    )  # fmt: skip
 
 
 @app.command()
@@ -144,32 +189,10 @@ def replay(
     verify: Annotated[bool, typer.Option("--verify", help="replay twice and compare bit for bit")] = False,
 ) -> None:
     """Put a real LiDAR recording through the onboard code."""
-    from rich.console import Console
-    from rich.progress import Progress
+    check_outputs(json_file, map_file)
+    from imagine.replay_command import replay_and_show
 
-    from imagine.onboard.replay import replay_file
-
-    with Progress(transient=True, console=Console(stderr=True)) as bar:
-        task = bar.add_task(recording.name, total=None)
-        result = replay_file(
-            recording,
-            None,
-            json_file,
-            map_file,
-            verify,
-            lambda done, total: bar.update(task, completed=done, total=total),
-        )
-    found = result.as_json()
-    _table(
-        f"replay of {recording.name}",
-        {
-            "scans": found["scans"],
-            "tracked": found["tracked"],
-            "position error, rms": f"{found['ate_rmse_m']:.3f} m" if "ate_rmse_m" in found else "no reference",
-            "time a scan": f"{found['scan_ms']['p50']:.1f} ms median, {found['scan_ms']['p99']:.1f} ms worst in 100",
-            "verified": "the same, bit for bit" if verify else "not asked for",
-        },
-    )
+    replay_and_show(recording, json_file, map_file, verify)
 
 
 @app.command()
@@ -205,35 +228,10 @@ def evaluate(
 ) -> None:
     """Measure a policy in the batched twin: coverage, time to 90%, contacts, bytes."""
     _needs("torch", "train")
-    from imagine.onboard.settings import DEFAULT_POLICY
-    from imagine.train.evaluation import evaluate as measure
-    from imagine.train.evaluation import named_policy
+    check_outputs(json_file)
+    from imagine.evaluate_command import evaluate_and_show
 
-    chosen = named_policy(policy or str(DEFAULT_POLICY))
-    rows = measure(
-        chosen, _level_list(levels), _numbers("--drones", drones), _protocol(protocol), episodes, seed,
-        progress=lambda text: print(text, file=sys.stderr),
-    )  # fmt: skip
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=f"{policy or 'shipped policy'}, {protocol}, {episodes} episodes each")
-    shown = (
-        "level",
-        "drones",
-        "coverage_mean",
-        "t90_mean",
-        "t90_reached",
-        "t95_mean",
-        "collisions_per_episode",
-        "path_m",
-    )
-    for name in shown:
-        table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(*(f"{row[name]:.3g}" if isinstance(row[name], float) else str(row[name]) for name in shown))
-    Console().print(table)
-    _write_json(json_file, rows)
+    evaluate_and_show(policy, levels, drones, _protocol(protocol), episodes, seed, json_file)
 
 
 @export_app.command("onnx")
@@ -246,7 +244,7 @@ def export_onnx(
     _needs("torch", "train")
     from imagine.export.onnx_export import export_onnx as write
 
-    _show_inspection(write(checkpoint, out, name))
+    _show_inspection(out, write(checkpoint, out, name))
 
 
 @export_app.command("inspect")
@@ -255,12 +253,12 @@ def export_inspect(model: Path) -> None:
     _needs("onnx", "train")
     from imagine.export.onnx_export import inspect
 
-    _show_inspection(inspect(model))
+    _show_inspection(model, inspect(model))
 
 
-def _show_inspection(found: Any) -> None:
+def _show_inspection(path: Path, found: Any) -> None:
     print(json.dumps(found.contract.model_dump(mode="json"), indent=2))
-    print(f"{found.path}: {found.size_bytes / 1e6:.2f} MB, {found.parameters} weights, hash matches")
+    print(f"{path}: {found.file_bytes / 1e6:.2f} MB, {found.parameters} weights, hash matches")
 
 
 @app.command()
@@ -272,30 +270,18 @@ def gcs(
     overrides: Overrides = None,
 ) -> None:
     """Watch a real fleet: the page and a live table."""
-    import os
-    import threading
+    from imagine.gcs_command import watch_fleet
 
-    from rich.console import Console
-    from rich.live import Live
+    watch_fleet(config, mesh, key_file, port, overrides or [])
 
-    from imagine.core.config import load_settings
-    from imagine.gcs.station import StationSettings, run_station
-    from imagine.gcs.table import render
-    from imagine.mesh_comm.keys import find_key
 
-    flags = [f"mesh={json.dumps(mesh)}"] if mesh is not None else []
-    flags += [f"port={port}"] if port is not None else []
-    settings = load_settings(StationSettings, config, [*flags, *(overrides or [])])
-    key = find_key(key_file, os.environ)
-    stop = threading.Event()
-    with Live(console=Console(), auto_refresh=False) as live, contextlib.suppress(KeyboardInterrupt):
-        run_station(
-            settings,
-            key,
-            lambda url: live.console.print(f"ground station: {url}"),
-            lambda snapshot: live.update(render(snapshot), refresh=True),
-            stop,
-        )
+@app.command()
+def doctor(json_file: JsonFile = None) -> None:
+    """Look whether this machine has what each command needs."""
+    check_outputs(json_file)
+    from imagine.doctor_command import examine_and_show
+
+    examine_and_show(json_file)
 
 
 @app.command()
@@ -315,50 +301,12 @@ def _needs(package: str, extra: str) -> None:
 
 
 def _protocol(name: str) -> Protocol:
+    from imagine.mesh_comm.settings import Protocol
+
     for known in get_args(Protocol):
         if name == known:
             return cast(Protocol, known)
     raise InputError(f"--protocol {name}: expected {', '.join(get_args(Protocol))}")
-
-
-def _level_list(text: str) -> list[str]:
-    levels: list[str] = []
-    for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        if dash and first.isdecimal() and last.isdecimal():
-            levels += [str(number) for number in range(int(first), int(last) + 1)]
-        else:
-            levels.append(part.strip())
-    return levels
-
-
-def _numbers(flag: str, text: str) -> list[int]:
-    try:
-        numbers = [int(part) for part in text.split(",")]
-    except ValueError as error:
-        raise InputError(f"{flag} {text}: expected whole numbers such as 3 or 1,2,3") from error
-    if not all(1 <= number <= 16 for number in numbers):
-        raise InputError(f"{flag} {text}: from 1 to 16 drones")
-    return numbers
-
-
-def _table(title: str, rows: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=title, show_header=False, title_justify="left")
-    for name, value in rows.items():
-        table.add_row(name, str(value))
-    Console().print(table)
-
-
-def _write_json(path: Path | None, data: Any) -> None:
-    if path is None:
-        return
-    try:
-        path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: the results cannot be written: {error.strerror}") from error
 
 
 if __name__ == "__main__":

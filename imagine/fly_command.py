@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,14 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from imagine.core.errors import InputError, WorkError
+from imagine.core.errors import WorkError
 from imagine.fly_sim import FlyOptions, Watcher, fly_sim
 from imagine.gcs.snapshot import FleetSnapshot
 from imagine.gcs.table import render
 from imagine.mesh_comm.settings import Protocol
 from imagine.onboard.settings import DEFAULT_POLICY
+from imagine.outputs import write_json
+from imagine.runner_processes import RunnerProcesses
 from imagine.sim.server import TickRecord
 
 _LINE_TICKS = 100
@@ -28,9 +29,14 @@ class _Screen(Watcher):
     def __init__(self, console: Console, live: Live | None) -> None:
         self._console, self._live = console, live
 
-    def started(self, url: str | None) -> None:
-        if url is not None:
-            self._console.print(f"ground station: {url}", highlight=False)
+    def compiling(self) -> None:
+        self._console.print("first start: compiling the kernels, which takes about 20 s once", highlight=False)
+
+    def serving(self, url: str) -> None:
+        self._console.print(f"ground station: {url}", highlight=False)
+
+    def landing(self) -> None:
+        self._console.print("landing all drones; once more ends the command at once", highlight=False)
 
     def tick(self, record: TickRecord, coverage: float, snapshot: FleetSnapshot | None) -> None:
         if self._live is not None:
@@ -42,6 +48,7 @@ class _Screen(Watcher):
 
 
 def fly_in_twin(
+    processes: RunnerProcesses,
     began: float,
     *,
     level: str,
@@ -58,9 +65,6 @@ def fly_in_twin(
     json_file: Path | None,
 ) -> None:
     """Fly, show and write the outcome. Raises WorkError, after all is shown, where a drone failed."""
-    for out in (map_file, json_file):
-        if out is not None and not out.absolute().parent.is_dir():
-            raise InputError(f"{out}: its folder does not exist")
     options = FlyOptions(
         level=level,
         drones=drones,
@@ -77,14 +81,10 @@ def fly_in_twin(
     console = Console()
     if console.is_terminal and not headless:
         with Live(console=console, auto_refresh=False) as live:
-            found = fly_sim(options, _Screen(console, live), began)
+            found = fly_sim(options, processes, _Screen(console, live), began)
     else:
-        found = fly_sim(options, _Screen(console, None), began)
-    if json_file is not None:
-        try:
-            json_file.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"{json_file}: the results cannot be written: {error.strerror}") from error
+        found = fly_sim(options, processes, _Screen(console, None), began)
+    write_json(json_file, found)
     _show(console, found)
     sys.stdout.flush()
     failed = [f"drone {drone['id']}: {drone['error']}" for drone in found["drones"] if drone["error"]]
@@ -98,13 +98,14 @@ def _show(console: Console, found: dict[str, Any]) -> None:
     shares = ", ".join(f"{name} {count / total:.0%}" for name, count in decided.items() if count)
     console.print(
         f"coverage {found['coverage']:.1%} after {found['ticks']} ticks "
-        f"(90% at {found['t90'] or 'no'} tick, 95% at {found['t95'] or 'no'} tick), "
-        f"{found['collisions']} collisions, {found['wall_s']:.0f} s; decided by {shares or 'nobody'}",
+        f"(90% {_reached(found['t90'])}, 95% {_reached(found['t95'])}), {found['collisions']} collisions, "
+        f"{found['wall_s']:.0f} s; decided by {shares or 'nobody'}",
         highlight=False,
     )
     table = Table(box=None, header_style="dim", pad_edge=False)
-    for name in ("drone", "flown", "own cells", "by scans", "by maps", "sent", "pose error", "tick p99", "ended"):
-        table.add_column(name, justify="left" if name in ("drone", "ended") else "right", overflow="fold")
+    for name in ("drone", "flown", "own cells", "by scans", "by maps", "sent", "pose error", "tick p99"):
+        table.add_column(name, justify="left" if name == "drone" else "right", no_wrap=True)
+    endings: dict[str, list[str]] = {}
     for drone in found["drones"]:
         error, tick_ms = drone["pose_rmse_m"], drone["tick_ms"]
         table.add_row(
@@ -116,6 +117,14 @@ def _show(console: Console, found: dict[str, Any]) -> None:
             f"{sum(drone['bytes_sent'].values()) / 1000:.0f} kB",
             "unknown" if error is None else f"{error:.3f} m",
             "unknown" if tick_ms is None else f"{tick_ms['p99']:.0f} ms",
-            drone["error"] or "; ".join(f["text"] for f in drone["failsafes"]) or drone["reason"] or drone["phase"],
         )
+        failsafes = "; ".join(f"{f['kind']} failsafe: {f['text']}" for f in drone["failsafes"])
+        ending = "; ".join(filter(None, (drone["error"], failsafes))) or drone["reason"] or drone["phase"]
+        endings.setdefault(ending, []).append(f"D{drone['id']}")
     console.print(table, highlight=False)
+    for ending, names in endings.items():
+        console.print(f"{', '.join(names)}: {ending}", highlight=False, markup=False)
+
+
+def _reached(tick: int | None) -> str:
+    return "not reached" if tick is None else f"at tick {tick}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import signal
 import subprocess
 import sys
@@ -11,45 +12,72 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from imagine.core.errors import WorkError
-from imagine.mesh_comm.keys import KEY_VARIABLE
-from imagine.onboard.settings import DroneSettings
 
-_END_DEADLINE_S = 8.0
+if TYPE_CHECKING:  # only names: this module is loaded before all others, so that the processes start at once
+    from imagine.onboard.settings import DroneSettings
+
+_END_DEADLINE_S = 15.0
+_KEY_BYTES = 32
 
 
 class RunnerProcesses:
     """One `python -m imagine.onboard` per drone, with its log, report and map in a folder that goes with it.
 
-    Drones are numbered from 1. Leaving the context ends every process, by SIGKILL if it must be.
+    Drones are numbered from 1. The processes load their code at once and wait for `fly`. They end when this process
+    does, however it ends; leaving the context ends every one of them, by SIGKILL if it must be.
     """
 
-    def __init__(self, settings: Sequence[DroneSettings], key: bytes) -> None:
-        """Start the processes; `key` is the swarm's, and reaches them by their environment alone."""
-        self._folder = tempfile.TemporaryDirectory(prefix="imagine-flight-")
+    def __init__(self, drones: int) -> None:
+        """Start the processes, with a new key for the swarm; it reaches them by their environment alone."""
+        self.key = secrets.token_bytes(_KEY_BYTES)
+        self._folder = tempfile.TemporaryDirectory(prefix="imagine-flight-", ignore_cleanup_errors=True)
         self.folder = Path(self._folder.name)
         # One thread each: three drones share the cores of one machine here, as they would not in flight.
-        environment = {**os.environ, KEY_VARIABLE: key.hex(), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        environment = {
+            **os.environ,
+            "IMAGINE_MESH_KEY": self.key.hex(),
+            "OMP_NUM_THREADS": "1",
+            "NUMBA_NUM_THREADS": "1",
+        }
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
+        self._asked: set[int] = set()
         self._stopped: set[int] = set()
+        try:
+            for number in range(1, drones + 1):
+                self._start(number, environment)
+        except OSError as error:
+            self.__exit__()
+            raise WorkError(f"drone {len(self._processes) + 1}: its process cannot be started: {error}") from error
+
+    def _start(self, number: int, environment: dict[str, str]) -> None:
+        with self._file(number, "log").open("wb") as log:
+            self._processes[number] = subprocess.Popen(
+                [sys.executable, "-m", "imagine.onboard", str(self._file(number, "yaml")), "--tethered"],
+                stdin=subprocess.PIPE,
+                bufsize=0,
+                stdout=log,
+                stderr=log,
+                env=environment,
+                start_new_session=True,  # Ctrl-C is for the flight, which then lands its drones
+            )
+
+    def fly(self, settings: Sequence[DroneSettings]) -> None:
+        """Give every process its settings, upon which it connects."""
         for drone in settings:
             number = drone.drone_id
             wired = drone.model_copy(
                 update={"report": self._file(number, "json"), "map_out": self._file(number, "npz")}
             )
-            path = self._file(number, "yaml")
-            path.write_text(wired.model_dump_json(), encoding="utf-8")  # JSON is YAML
-            with self._file(number, "log").open("wb") as log:
-                self._processes[number] = subprocess.Popen(
-                    [sys.executable, "-m", "imagine.onboard", str(path)],
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=log,
-                    env=environment,
-                    start_new_session=True,  # Ctrl-C is for the flight, which then lands its drones
-                )
+            self._file(number, "yaml").write_text(wired.model_dump_json(), encoding="utf-8")  # JSON is YAML
+            tether = self._processes[number].stdin
+            assert tether is not None
+            try:
+                tether.write(b"fly\n")
+            except BrokenPipeError:
+                continue  # it has ended, and will be asked why
 
     def _file(self, number: int, kind: str) -> Path:
         return self.folder / f"drone-{number}.{kind}"
@@ -58,10 +86,6 @@ class RunnerProcesses:
         """Tell whether a drone's process lives."""
         return self._processes[number].poll() is None
 
-    def pid(self, number: int) -> int:
-        """Return the process id of a drone."""
-        return self._processes[number].pid
-
     def any_running(self) -> bool:
         """Tell whether any drone's process lives."""
         return any(process.poll() is None for process in self._processes.values())
@@ -69,10 +93,13 @@ class RunnerProcesses:
     def ended_badly(self, number: int) -> str:
         """Return why a drone's process ended, in words for the pilot; empty while it runs or when it ended well."""
         status = self._processes[number].poll()
-        if status is None or status == 0 or number in self._stopped:
+        if number in self._stopped:
+            return f"runner process did not end within {_END_DEADLINE_S:.0f} s and was killed"
+        # one that was on its way out when it was asked to end has died of the question
+        if status is None or status == 0 or (number in self._asked and status == -signal.SIGTERM):
             return ""
         if status < 0:
-            return f"runner process killed by {signal.Signals(-status).name}"
+            return f"runner process killed by {_signal_name(-status)}"
         return f"runner process ended with status {status}: {self.last_words(number)}"
 
     def last_words(self, number: int) -> str:
@@ -85,13 +112,14 @@ class RunnerProcesses:
         return self._processes[number].poll()
 
     def request_end(self) -> None:
-        """Ask every process to land its drone and end."""
-        for process in self._processes.values():
-            if process.poll() is None:
+        """Ask every process, once, to land its drone and end."""
+        for number, process in self._processes.items():
+            if number not in self._asked and process.poll() is None:
+                self._asked.add(number)
                 process.terminate()
 
     def wait_end(self) -> None:
-        """Wait until all have ended; past a deadline they are killed, which `ended_badly` then passes over."""
+        """Wait until all have ended; past a deadline they are killed, and `ended_badly` says so."""
         deadline = time.monotonic() + _END_DEADLINE_S
         for number, process in self._processes.items():
             try:
@@ -123,5 +151,15 @@ class RunnerProcesses:
         for process in self._processes.values():
             if process.poll() is None:
                 process.kill()
+        for process in self._processes.values():
             process.wait(5.0)
+            if process.stdin is not None:
+                process.stdin.close()
         self._folder.cleanup()
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # a real-time signal has no name
+        return f"signal {number}"

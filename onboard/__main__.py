@@ -1,4 +1,8 @@
-"""`python -m imagine.onboard SETTINGS.yaml`: fly one drone, without the command line's extras, so it starts fast."""
+"""`python -m imagine.onboard SETTINGS.yaml`: fly one drone, without the command line's extras, so it starts fast.
+
+With --tethered it loads its code first and waits for a line on standard input before it reads the settings; it lands
+and ends when standard input does.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +10,28 @@ import logging
 import sys
 from pathlib import Path
 
-from imagine.core.config import load_settings
 from imagine.core.errors import ImagineError
-from imagine.onboard.settings import DroneSettings
 
 
 def main(arguments: list[str]) -> int:
     """Run the drone that the settings file describes; return the exit status."""
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    if len(arguments) != 1:
-        print("usage: python -m imagine.onboard SETTINGS.yaml", file=sys.stderr)
+    if len(arguments) not in (1, 2) or arguments[1:] not in ([], ["--tethered"]):
+        print("usage: python -m imagine.onboard SETTINGS.yaml [--tethered]", file=sys.stderr)
         return 2
     try:
-        settings = load_settings(DroneSettings, Path(arguments[0]))
-        from imagine.onboard.process import run_drone
+        if arguments[1:]:
+            from imagine.onboard import tether
 
-        return run_drone(settings)
+            tether.load_code()
+            if not tether.wait_for_settings():
+                return 0
+            tether.end_with_standard_input()
+        from imagine.core.config import load_settings
+        from imagine.onboard.process import run_drone
+        from imagine.onboard.settings import DroneSettings
+
+        return run_drone(load_settings(DroneSettings, Path(arguments[0])))
     except ImagineError as error:
         print(f"imagine: {error}", file=sys.stderr)
         return error.exit_status

@@ -10,12 +10,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 from pydantic import Field
 
 from imagine.core.config import Settings
 from imagine.core.frames import IDENTITY, Pose, wrap_angle
+from imagine.onboard.extended_kalman import ExtendedKalmanFilter
 
 _STATES = 6
 _H = np.eye(3, _STATES)

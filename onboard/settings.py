@@ -56,7 +56,7 @@ class LadderSettings(Settings):
     rescue_s: float = Field(default=5.0, gt=0.0, description="longest first rescue; it doubles while rescues repeat")
     rescue_longest_s: float = Field(default=20.0, gt=0.0)
     rescue_travel_m: float = Field(default=1.5, gt=0.0, description="travelled so far: the policy gets it back")
-    explored_s: float = Field(default=5.0, gt=0.0, description="no frontier in reach for so long: explored, land")
+    explored_s: float = Field(default=2.0, gt=0.0, description="no frontier in reach for so long: explored, land")
     lost_hold_s: float = Field(default=0.5, gt=0.0, description="odometry, scans or telemetry lost: hold")
     lost_land_s: float = Field(default=3.0, gt=0.0, description="lost for so long: land")
     battery_land: float = Field(default=0.15, ge=0.0, le=1.0, description="land at or below this charge")

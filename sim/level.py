@@ -29,6 +29,7 @@ BUILT_IN = ("0", "1", "2", "3", "4", "5", "6")
 _LAUNCH_SPACING_M = 0.7
 _LAUNCH_CLEARANCE_M = 0.25
 _LARGEST_M = 200.0
+_MARGIN_M = 25.0  # the twin lays worlds 256 m apart, so nothing of a level may reach further out
 
 
 class Box(Settings):
@@ -205,12 +206,29 @@ def _build(name: str, where: str, data: dict[str, Any], lines: dict[KeyPath, int
     if base is not None:
         polygons = [*base.polygons, *polygons]
         circles = np.concatenate((base.circles, circles))
+    _check_extent(file, where, lines)
     level = Level(name, file.title, outline, tuple(polygons), circles, launch)
     if not level.is_free(np.array([launch]), _LAUNCH_CLEARANCE_M)[0]:
         raise InputError(
             f"{where}:{lines.get(('launch',), 1)}: launch {launch} is in or within {_LAUNCH_CLEARANCE_M} m of a wall"
         )
     return level
+
+
+def _check_extent(file: LevelFile, where: str, lines: dict[KeyPath, int]) -> None:
+    """Refuse geometry so far out that it would take all memory or reach into the world beside."""
+    groups: dict[str, list[list[Point]]] = {
+        "outline": [[point] for point in file.outline or ()],
+        "walls": [list(wall) for wall in file.walls],
+        "boxes": [[box.center, (box.center[0] + max(box.size), box.center[1] + max(box.size))] for box in file.boxes],
+        "circles": [[post.center, (post.center[0] + post.radius, post.center[1])] for post in file.circles],
+    }
+    for key, items in groups.items():
+        for index, points in enumerate(items):
+            if not all(-_MARGIN_M <= c <= _LARGEST_M + _MARGIN_M for point in points for c in point):
+                line = lines.get((key, index), lines.get((key,), 1))
+                least, most = -_MARGIN_M, _LARGEST_M + _MARGIN_M
+                raise InputError(f"{where}:{line}: {key}.{index}: a level lies within {least:g} and {most:g} m")
 
 
 def _outline(file: LevelFile, base: Level | None) -> NDArray[np.float64]:

@@ -1,0 +1,63 @@
+"""What `imagine evaluate` reads from its flags, and the table it shows."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from imagine.core.errors import InputError
+from imagine.mesh_comm.settings import Protocol
+from imagine.onboard.settings import DEFAULT_POLICY
+from imagine.outputs import write_json
+from imagine.train.evaluation import evaluate, named_policy
+
+_SHOWN = (
+    "level", "drones", "coverage_mean", "t90_mean", "t90_reached", "t95_mean", "collisions_per_episode", "path_m",
+)  # fmt: skip
+
+
+def evaluate_and_show(
+    policy: str, levels: str, drones: str, protocol: Protocol, episodes: int, seed: int, json_file: Path | None
+) -> None:
+    """Measure a policy (empty: the shipped one) and print a row per level and team size."""
+    chosen_levels, sizes = level_list(levels), team_sizes(drones)
+    chosen = named_policy(policy or str(DEFAULT_POLICY))
+    rows = evaluate(
+        chosen, chosen_levels, sizes, protocol, episodes, seed,
+        progress=lambda text: print(text, file=sys.stderr),
+    )  # fmt: skip
+    table = Table(title=f"{policy or 'shipped policy'}, {protocol}, {episodes} episodes each")
+    for name in _SHOWN:
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(*(f"{row[name]:.3g}" if isinstance(row[name], float) else str(row[name]) for name in _SHOWN))
+    Console().print(table)
+    write_json(json_file, rows)
+
+
+def level_list(text: str) -> list[str]:
+    """Return the levels of a list such as 4, 0-6 or 1,3,house.yaml. Raises InputError on an empty range."""
+    levels: list[str] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        if dash and first.isdecimal() and last.isdecimal():
+            if int(last) < int(first):
+                raise InputError(f"--levels {part.strip()}: the range is empty; write {last}-{first}")
+            levels += [str(number) for number in range(int(first), int(last) + 1)]
+        else:
+            levels.append(part.strip())
+    return levels
+
+
+def team_sizes(text: str) -> list[int]:
+    """Return the numbers of a list such as 3 or 1,2,3. Raises InputError past 1 to 16."""
+    try:
+        numbers = [int(part) for part in text.split(",")]
+    except ValueError as error:
+        raise InputError(f"--drones {text}: expected whole numbers such as 3 or 1,2,3") from error
+    if not all(1 <= number <= 16 for number in numbers):
+        raise InputError(f"--drones {text}: from 1 to 16 drones")
+    return numbers

@@ -1,0 +1,56 @@
+"""The first start after an installation: every kernel is compiled once, on two cores, and kept on disk.
+
+Left to themselves several runners would each compile the same kernels in the same moment.
+`python -m imagine.first_start` compiles those of the twin.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from imagine.onboard.settings import DroneSettings
+from imagine.sim.level import load_level
+from imagine.sim.twin import Twin
+
+_TWIN_DEADLINE_S = 300.0
+
+
+def compile_kernels(settings: DroneSettings, on_start: Callable[[], None]) -> None:
+    """Compile all that a simulated flight runs, unless an earlier start has; `on_start` is called where it has not."""
+    marker = Path(os.environ["NUMBA_CACHE_DIR"]) / "flight-kernels"
+    if marker.exists():
+        return
+    on_start()
+    from imagine.onboard.build import warm_up
+
+    twin = subprocess.Popen([sys.executable, "-m", "imagine.first_start"], stdin=subprocess.DEVNULL)
+    try:
+        warm_up(settings, None)
+        twin.wait(_TWIN_DEADLINE_S)
+    except subprocess.TimeoutExpired:
+        return  # the flight then compiles for itself
+    finally:
+        if twin.poll() is None:
+            twin.kill()
+            twin.wait()
+    try:
+        marker.touch()
+    except OSError:
+        return  # without a cache everybody compiles for himself
+
+
+def compile_twin() -> None:
+    """Run a small twin through one tick."""
+    twin = Twin([load_level("3")], drones=2)
+    twin.scan()
+    twin.step(np.zeros((1, 2, 3)))
+
+
+if __name__ == "__main__":
+    compile_twin()

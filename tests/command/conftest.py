@@ -1,0 +1,8 @@
+"""Lends the onboard tests' tiny policies to the tests of the command."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "onboard"))

@@ -1,0 +1,115 @@
+"""The policy contract travels as JSON and comes back the same, or is refused by field."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imagine.core.contract import ActionSpec, LidarContract, PolicyContract
+from imagine.core.errors import InputError
+from imagine.core.lidar import LD19, LidarSpec
+from imagine.core.mapping import MapSettings
+from imagine.core.observation_spec import ObservationSpec
+from imagine.core.raster import CELL, HIT, LIMIT, MISS, TILE, UNIT_LOG_ODDS
+from imagine.core.vehicle_limits import VehicleLimits
+
+
+def contract(**changes: Any) -> PolicyContract:
+    fields: dict[str, Any] = {
+        "name": "explorer",
+        "observation": ObservationSpec(),
+        "action": ActionSpec(),
+        "rate_hz": 10.0,
+        "lidar": LidarContract.of(LD19),
+        "map": MapSettings(),
+        "limits": VehicleLimits(),
+        "training": {"run": "a", "coverage": 0.97, "levels": ["0", "1"]},
+    }
+    return PolicyContract(**(fields | changes))
+
+
+@given(
+    st.text(min_size=1, max_size=100),
+    st.sampled_from(["plane", "body"]),
+    st.sampled_from(["map", "heading"]),
+    st.integers(1, 720),
+    st.floats(0.1, 6.0),
+    st.floats(0.1, 5.0),
+    st.dictionaries(st.text(max_size=5), st.one_of(st.integers(), st.booleans(), st.none(), st.text(max_size=5))),
+)
+def test_it_comes_back_the_same(
+    name: str, mode: Any, axes: Any, beams: int, fov: float, speed: float, training: dict[str, Any]
+) -> None:
+    sent = contract(
+        name=name,
+        action=ActionSpec(mode=mode, speed_mps=speed),
+        observation=ObservationSpec(axes=axes),
+        lidar=LidarContract.of(LidarSpec(beams=beams, fov=fov, start=-fov / 2)),
+        training=training,
+    )
+    back = PolicyContract.from_json(sent.to_json(), "model.onnx")
+    assert back == sent
+    assert back.to_json() == sent.to_json()
+    assert back.lidar.spec() == LidarSpec(beams=beams, fov=fov, start=-fov / 2)
+
+
+def test_equal_contracts_have_equal_texts() -> None:
+    assert contract(training={"a": 1, "b": 2}).to_json() == contract(training={"b": 2, "a": 1}).to_json()
+
+
+def test_the_map_settings_record_what_the_code_does() -> None:
+    settings = MapSettings()
+    assert (settings.cell_m, settings.tile_cells, settings.unit_log_odds) == (CELL, TILE, UNIT_LOG_ODDS)
+    assert (settings.hit, settings.miss, settings.limit) == (HIT, MISS, LIMIT)
+
+
+def changed(path: str, value: Any) -> str:
+    data = json.loads(contract().to_json())
+    target = data
+    *parents, last = path.split(".")
+    for part in parents:
+        target = target[part]
+    if value is ...:
+        del target[last]
+    else:
+        target[last] = value
+    return json.dumps(data)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        ("contract_version", 2, "contract_version"),
+        ("name", "", "name"),
+        ("rate_hz", 0, "rate_hz"),
+        ("rate_hz", ..., "key 'rate_hz' is missing"),
+        ("lidar.beams", ..., "key 'lidar.beams' is missing"),
+        ("lidar.beams", "many", r"lidar\.beams"),
+        ("observation.version", 9, r"observation\.version"),
+        ("observation.view_scale", 1, r"unknown key 'observation\.view_scale'; did you mean 'view_scales_m'"),
+        ("action.mode", "jump", r"action\.mode"),
+        ("limits.speed_mps", -1, r"limits\.speed_mps"),
+        ("map.range_cap_m", None, r"map\.range_cap_m"),
+        ("rate_hz", float("nan"), "rate_hz"),
+    ],
+)
+def test_a_contract_that_does_not_fit_is_refused_by_field(path: str, value: Any, said: str) -> None:
+    with pytest.raises(InputError, match=r"^m\.onnx: contract: .*" + said):
+        PolicyContract.from_json(changed(path, value), "m.onnx")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", '"x"', "null", "{} {}", "[" * 100_000, "9" * 5000])
+def test_what_is_no_contract_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"m\.onnx: "):
+        PolicyContract.from_json(text, "m.onnx")
+
+
+@pytest.mark.parametrize("field", [("beams", 0), ("fov", 9.0), ("range_min", 20.0)])
+def test_an_impossible_lidar_is_refused_when_it_is_built(field: tuple[str, Any]) -> None:
+    text = changed(f"lidar.{field[0]}", field[1])
+    with pytest.raises(InputError, match=field[0]):
+        PolicyContract.from_json(text, "m.onnx").lidar.spec()
