@@ -34,7 +34,9 @@ class LidarSpec:
             raise InputError(f"LiDAR: fov is {self.fov} rad, needs to be in (0, 2 pi]")
         if not 0.0 <= self.range_min < self.range_max:
             raise InputError(f"LiDAR: range_min {self.range_min} m must lie below range_max {self.range_max} m")
-        if self.rate_hz <= 0.0:
+        if not self.noise_std >= 0.0:
+            raise InputError(f"LiDAR: noise_std is {self.noise_std} m, needs to be 0 or more")
+        if not self.rate_hz > 0.0:
             raise InputError(f"LiDAR: rate_hz is {self.rate_hz}, needs to be positive")
 
     @property

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from imagine.onboard.settings import DroneSettings
+from imagine.sim.coverage import Coverage
 from imagine.sim.level import load_level
 from imagine.sim.twin import Twin
 
@@ -45,12 +46,14 @@ def compile_kernels(settings: DroneSettings, on_start: Callable[[], None]) -> No
         return  # without a cache everybody compiles for himself
 
 
-def compile_twin() -> None:
-    """Run a small twin through one tick."""
-    twin = Twin([load_level("3")], drones=2)
-    twin.scan()
+def warm_twin() -> None:
+    """Run a small twin through one tick: its kernels are loaded, or compiled, before a flight's first tick is due."""
+    level = load_level("3")
+    twin = Twin([level], drones=2)
+    scans = twin.scan()[0]
+    Coverage(level, 2, twin.lidar, range_cap_m=4.0).update(twin.poses[0], scans)
     twin.step(np.zeros((1, 2, 3)))
 
 
 if __name__ == "__main__":
-    compile_twin()
+    warm_twin()

@@ -78,7 +78,7 @@ def fly_in_twin(
         port=port,
         map_image=map_file,
     )
-    console = Console()
+    console = Console(soft_wrap=not sys.stdout.isatty())  # a file or a pipe has no width
     if console.is_terminal and not headless:
         with Live(console=console, auto_refresh=False) as live:
             found = fly_sim(options, processes, _Screen(console, live), began)

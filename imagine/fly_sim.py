@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from imagine.core.errors import ImagineError, InputError, WorkError
-from imagine.first_start import compile_kernels
+from imagine.first_start import compile_kernels, warm_twin
 from imagine.flight_ground import FlightGround
 from imagine.flight_results import FlightLog, results
 from imagine.flown_map import draw_flown_map
@@ -97,6 +97,7 @@ def fly_sim(options: FlyOptions, processes: RunnerProcesses, watcher: Watcher, b
                 for drone, link in zip(settings, server.endpoints, strict=True)
             ]
         )
+        warm_twin()  # while the runners load theirs
         coverage = Coverage(level, options.drones, twin.lidar, settings[0].map.range_cap_m)
         try:
             server.wait_connected(_CONNECT_S)

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from imagine.core.errors import WorkError
 from imagine.core.frames import Pose
+from imagine.first_start import warm_twin
 from imagine.sim.drone_edge import Endpoint
 from imagine.sim.level import load_level
 from imagine.sim.server import SitlServer, SitlSettings, TickRecord
@@ -55,7 +56,7 @@ def serve_twin(options: ServeOptions) -> None:
         ground_modem=options.mesh,
     )
     with StopSignals() as stopping, SitlServer(twin, settings, options.seed) as server:
-        twin.scan()  # compiles or loads its kernels before anyone waits for them
+        warm_twin()  # before anyone waits for a tick
         for endpoint, pose in zip(server.endpoints, poses, strict=True):
             console.print(f"drone {endpoint.drone}: {runner_command(endpoint, pose, options.lockstep)}")
         if server.ground_endpoint is not None:

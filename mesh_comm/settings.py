@@ -24,6 +24,8 @@ class MeshSettings(Settings):
     scan_period_s: float = Field(default=0.1, gt=0.0, description="at most one scan is sent per period")
     tile_period_s: float = Field(default=1.0, gt=0.0, description="the same tile is sent at most once per period")
     peer_timeout_s: float = Field(default=2.0, gt=0.0, description="a peer silent for longer is out of reach")
-    mask_radius_m: float = Field(default=TEAMMATE_RADIUS_M, ge=0.0, description="returns this close to a teammate are not mapped")
+    mask_radius_m: float = Field(
+        default=TEAMMATE_RADIUS_M, ge=0.0, description="returns this close to a teammate are not mapped"
+    )
     command_repeat_s: float = Field(default=2.0, ge=0.0, description="the ground repeats a command for so long")
     max_sources: int = Field(default=32, ge=1, le=254, description="most drones whose maps are kept: bounds memory")

@@ -170,7 +170,7 @@ def _exchange(layers, versions, connected, relays, tiles_a_tick, tiles_sent):  #
     """Copy newer tiles along the links of one world, each sender within its budget for the tick.
 
     One broadcast serves every neighbour that lacks the tile. A sender offers its own layer and, when it relays, what
-    it holds of others. What arrives in this tick is passed on in the next.
+    it holds of others. A tile that a drone first gets in this tick is passed on in the next.
     """
     drones = len(connected)
     before = versions.copy()
@@ -181,9 +181,9 @@ def _exchange(layers, versions, connected, relays, tiles_a_tick, tiles_sent):  #
                 continue
             for i in range(versions.shape[2]):
                 for j in range(versions.shape[3]):
-                    version = before[sender, source, i, j]
-                    if version == 0 or versions[sender, source, i, j] != version:
+                    if before[sender, source, i, j] == 0:
                         continue
+                    version = versions[sender, source, i, j]
                     wanted = False
                     for receiver in range(drones):
                         if (

@@ -15,7 +15,7 @@ from PIL import Image
 from room_scans import ROUND, fly, measure
 
 from imagine.core.errors import InputError, WorkError
-from imagine.core.frames import IDENTITY, Pose, relative
+from imagine.core.frames import IDENTITY, relative
 from imagine.core.lidar import LD19, Scan
 from imagine.core.raster import CELL
 from imagine.onboard.alignment import align_planar, ate_rmse
