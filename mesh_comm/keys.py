@@ -67,6 +67,11 @@ def find_key(path: Path | None, environ: Mapping[str, str]) -> bytes:
     raise InputError(f"no mesh key: name a key file or set {KEY_VARIABLE}; make one with `imagine keygen`")
 
 
+def boot_number(unix_time_s: float) -> int:
+    """Return the boot number that the clock alone gives: seconds since 2020, at least 0."""
+    return max(0, int(unix_time_s) - _EPOCH_S)
+
+
 def next_boot_number(path: Path, unix_time_s: float) -> int:
     """Return a number greater than at any earlier start, and remember it in the file `path`.
 
@@ -80,7 +85,7 @@ def next_boot_number(path: Path, unix_time_s: float) -> int:
         raise InputError(f"{path}: does not hold a boot number; remove it if the clock is right") from error
     except OSError as error:
         raise InputError(f"{path}: the boot number cannot be read: {error.strerror}") from error
-    boot = max(last + 1, int(unix_time_s) - _EPOCH_S)
+    boot = max(last + 1, boot_number(unix_time_s))
     fresh = path.with_name(path.name + ".new")
     try:
         with fresh.open("w", encoding="ascii") as file:

@@ -14,7 +14,7 @@ from imagine.core.observation import observe
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.planner import plan_velocity
 from imagine.core.shield import shield_velocity
-from imagine.mesh_comm.keys import find_key, next_boot_number
+from imagine.mesh_comm.keys import boot_number, find_key, next_boot_number
 from imagine.mesh_comm.node import MeshNode
 from imagine.mesh_comm.seal import KEY_BYTES, Sealer
 from imagine.onboard.perception import Perception
@@ -23,7 +23,6 @@ from imagine.onboard.records import FlightMode, Telemetry, TickInput
 from imagine.onboard.runner import Runner
 from imagine.onboard.settings import DroneSettings
 
-_EPOCH_S = 1_577_836_800  # 2020-01-01, where boot numbers count from
 _WARM_TICKS = 8
 
 
@@ -55,7 +54,7 @@ def mesh_sealer(settings: DroneSettings, environ: Mapping[str, str], unix_time_s
     if settings.boot_file is not None:
         boot = next_boot_number(settings.boot_file, unix_time_s)
     else:
-        boot = max(0, int(unix_time_s) - _EPOCH_S)
+        boot = boot_number(unix_time_s)
     return Sealer(key, settings.drone_id, boot)
 
 

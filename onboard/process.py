@@ -41,12 +41,15 @@ _RELEASED_S = 60.0
 
 
 class ScanClock:
-    """The runner's clock: the newest scan's stamp, carried on by the wall clock between scans. It never runs back."""
+    """The runner's clock: the newest scan's stamp, carried on by the wall clock between scans. It never runs back.
+
+    Before the first scan it stands at zero: a sensor's stamps may begin anywhere.
+    """
 
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
         """Start at zero."""
         self._monotonic = monotonic
-        self._stamp, self._set_at = 0.0, monotonic()
+        self._stamp, self._set_at = 0.0, math.nan
         self._latest = 0.0
 
     def set(self, stamp: float) -> None:
@@ -55,7 +58,8 @@ class ScanClock:
 
     def now(self) -> float:
         """Return the time, seconds; while it is ahead of a slow sensor's stamps it waits for them."""
-        self._latest = max(self._latest, self._stamp + self._monotonic() - self._set_at)
+        if not math.isnan(self._set_at):
+            self._latest = max(self._latest, self._stamp + self._monotonic() - self._set_at)
         return self._latest
 
 
@@ -113,7 +117,7 @@ class Loop:
         self.clock = clock
         self.record = FlightRecord(settings.drone_id)
         self.gave_up: str | None = None
-        self._ticked_at = -math.inf
+        self._ticked_at = math.inf  # the flight begins with the first scan, and so does its time
         self._fed_at = time.monotonic()
         self._final_at: float | None = None
 

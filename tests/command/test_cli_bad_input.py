@@ -168,11 +168,11 @@ def test_models_that_cannot_fly_are_refused(tmp_path: Path) -> None:
     refused([*flight, tmp_path / "none.onnx"], r"none\.onnx", "No such file")
     corrupt = tmp_path / "corrupt.onnx"
     corrupt.write_bytes(write_policy(tmp_path / "good.onnx").read_bytes()[:-200])
-    refused([*flight, corrupt], r"corrupt\.onnx", real=True)
+    refused([*flight, corrupt], r"corrupt\.onnx")
     corrupt.write_bytes(b"this is no model\n")
     refused([*flight, corrupt], r"corrupt\.onnx: is not a usable ONNX model")
     bare = write_policy(tmp_path / "bare.onnx", text="")
-    refused([*flight, bare], r"bare\.onnx: has no policy contract", "imagine export onnx", real=True)
+    refused([*flight, bare], r"bare\.onnx: has no policy contract", "imagine export onnx")
     wanted = LidarContract.of(LD19).model_copy(update={"beams": 720})
     unfit = write_policy(tmp_path / "unfit.onnx", make_contract(lidar=wanted))
     refused(

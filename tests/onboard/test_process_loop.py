@@ -136,6 +136,15 @@ def test_the_scan_clock_goes_on_between_scans_and_never_back():
     assert clock.now() == pytest.approx(500.6)
 
 
+def test_the_clock_stands_before_the_first_scan_so_that_no_stamp_is_in_its_past():
+    wall = [10.0]
+    clock = ScanClock(lambda: wall[0])
+    wall[0] += 60.0
+    assert clock.now() == 0.0
+    clock.set(0.1)
+    assert clock.now() == pytest.approx(0.1)
+
+
 def test_a_mesh_without_a_key_is_refused():
     with pytest.raises(InputError, match="IMAGINE_MESH_KEY"):
         mesh_sealer(SETTINGS.model_copy(update={"mesh": "udpout://127.0.0.1:1"}), {}, 2e9)
