@@ -31,7 +31,7 @@ from imagine.stop_signals import StopSignals
 _CONNECT_S = 60.0
 _LAND_TICKS = 150  # after Ctrl-C: what a landing takes
 _TICKS_AFTER = 3  # after the last touchdown, so that its runner hears of it
-_MOTION_MPS = 0.1
+_MOTION_MPS, _LIFTED_M = 0.1, 0.05
 _LOCKSTEP_REPLY_S = 10.0  # a runner that lives but is slow is waited for; a dead one is noticed at once
 
 
@@ -148,7 +148,7 @@ class _Flight:
             ticks_after = ticks_after - 1 if self._all_down(record) else _TICKS_AFTER
             share = self.coverage.update(record.poses, self.server.last_scans)
             self.log.add(record, share)
-            if not self.first_motion_s and abs(record.velocities[:, :2]).max() > _MOTION_MPS:
+            if not self.first_motion_s and _moves(record):
                 self.first_motion_s = time.monotonic() - self.began
             snapshot = self.ground.listen(self.server, record, share, self.processes) if self.ground else None
             self.watcher.tick(record, share, snapshot)
@@ -168,6 +168,12 @@ class _Flight:
         reports = {number: self.processes.report(number) for number in numbers}
         deaths = {number: self.processes.ended_badly(number) for number in numbers}
         return results(self.log, reports, deaths, time.monotonic() - self.began, self.first_motion_s)
+
+
+def _moves(record: TickRecord) -> bool:
+    """Tell whether a drone has left the ground or flies along."""
+    lifted = any(vehicle.height_m > _LIFTED_M for vehicle in record.vehicles)
+    return lifted or bool(abs(record.velocities[:, :2]).max() > _MOTION_MPS)
 
 
 def _drone_settings(options: FlyOptions, poses: list[Any]) -> list[DroneSettings]:
