@@ -64,8 +64,15 @@ def parse_yaml(text: str, where: str) -> tuple[dict[str, Any], dict[KeyPath, int
     if not isinstance(data, dict):
         raise InputError(f"{where}:1: expected keys and values, found {type(data).__name__}")
     lines: dict[KeyPath, int] = {}
-    _collect_lines(node, (), lines, set())
+    try:
+        _collect_lines(node, (), lines, set())
+    except _RepeatedKey as error:
+        raise InputError(f"{where}:{error}") from error
     return data, lines
+
+
+class _RepeatedKey(ValueError):
+    """A key given twice: YAML would silently keep the last."""
 
 
 def _collect_lines(node: yaml.Node | None, at: KeyPath, lines: dict[KeyPath, int], visited: set[int]) -> None:
@@ -74,6 +81,10 @@ def _collect_lines(node: yaml.Node | None, at: KeyPath, lines: dict[KeyPath, int
     visited.add(id(node))
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
+            if (*at, key.value) in lines:
+                first, again = lines[(*at, key.value)], key.start_mark.line + 1
+                name = ".".join(map(str, (*at, key.value)))
+                raise _RepeatedKey(f"{again}: key '{name}' stands in line {first} already")
             lines[(*at, key.value)] = key.start_mark.line + 1
             _collect_lines(value, (*at, key.value), lines, visited)
     elif isinstance(node, yaml.SequenceNode):
@@ -121,7 +132,7 @@ def check_settings(model: type[S], data: dict[str, Any], where: str, lines: dict
         first = error.errors()[0]
         location: KeyPath = tuple(first["loc"])
         line = _line_of(location, lines or {})
-        key = ".".join(map(str, location)) or "(whole file)"
+        key = ".".join(map(str, location))
         place = f"{where}:{line}" if line else where
         if first["type"] == "extra_forbidden":
             raise InputError(f"{place}: unknown key '{key}'{_nearest(model, location)}") from error
@@ -129,6 +140,8 @@ def check_settings(model: type[S], data: dict[str, Any], where: str, lines: dict
             raise InputError(f"{place}: key '{key}' is missing") from error
         got = first.get("input")
         message = first["msg"].removeprefix("Value error, ")
+        if not key:  # a rule about several keys at once
+            raise InputError(f"{place}: {message}" if data else f"{where}: it is empty: {message}") from error
         raise InputError(f"{place}: {key}: {message} (got {_SHORT.repr(got):.80})") from error
 
 

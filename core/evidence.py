@@ -20,7 +20,7 @@ from imagine.core.lidar import LidarSpec, Scan
 from imagine.core.raster import CELL, LIMIT, TILE, integrate_scan, sum_layers
 
 MAX_TILES = 160
-"""Largest extent of a map, in tiles along an axis (512 m): a bound on memory whatever arrives."""
+"""Largest extent any map may be given, in tiles along an axis (512 m)."""
 
 
 class TileKey(NamedTuple):
@@ -58,9 +58,19 @@ class EvidenceMap:
     Sources are small integers (drone ids). Metres and radians, map frame.
     """
 
-    def __init__(self, own: int, half_extent_m: float = 12.8) -> None:
-        """Make an empty map for drone `own`, reserving `half_extent_m` around the origin."""
+    def __init__(self, own: int, half_extent_m: float = 12.8, max_extent_m: float = 128.0) -> None:
+        """Make an empty map for drone `own`, reserving `half_extent_m` around the origin.
+
+        It grows to at most `max_extent_m` along an axis: a bound on memory, and on the time a tick takes, whatever
+        peers send. Raises InputError if that is less than is reserved, or more than 512 m.
+        """
         tiles = max(1, math.ceil(half_extent_m / (CELL * TILE)))
+        self._max_tiles = math.floor(max_extent_m / (CELL * TILE) + 1e-9)
+        if not 2 * tiles <= self._max_tiles <= MAX_TILES:
+            raise InputError(
+                f"a map of {max_extent_m:g} m at most, with {half_extent_m:g} m reserved each way: "
+                f"needs to hold what is reserved, and be at most {MAX_TILES * CELL * TILE:.0f} m"
+            )
         self.own = own
         self.corner = TileKey(-tiles, -tiles)
         self.tile_rows = self.tile_columns = 2 * tiles
@@ -183,10 +193,10 @@ class EvidenceMap:
         rows, columns = high_row - low.row, high_column - low.column
         if low == self.corner and (rows, columns) == (self.tile_rows, self.tile_columns):
             return
-        if rows > MAX_TILES or columns > MAX_TILES:
+        if rows > self._max_tiles or columns > self._max_tiles:
             raise InputError(
-                f"the map would grow to {columns}x{rows} tiles, over the limit of {MAX_TILES}: "
-                "a pose or tile lies far outside"
+                f"the map would grow to {columns}x{rows} tiles, over the limit of {self._max_tiles} "
+                f"({self._max_tiles * CELL * TILE:.0f} m): a pose or tile lies far outside"
             )
         for source, old in self.layers.items():
             new = Layer.empty(rows, columns)

@@ -128,6 +128,8 @@ class FleetSnapshot:
     events: tuple[FleetEvent, ...] = ()
     command: CommandView | None = None
     dropped_datagrams: int = 0
+    over: str = ""
+    """How the flight ended, once it has; what is shown then is final."""
 
     @property
     def known_free_m2(self) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal, NamedTuple
+
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -10,20 +12,46 @@ from imagine.gcs.snapshot import DroneView, FleetEvent, FleetSnapshot
 
 _EVENTS_SHOWN = 5
 _STATE_STYLE = {"policy": "green", "frontier": "cyan", "hold": "yellow", "land": "yellow"}
+
+
+class _Column(NamedTuple):
+    name: str
+    justify: Literal["left", "right"]
+    from_width: int
+
+
+_COLUMNS = (
+    _Column("drone", "left", 0),
+    _Column("state", "left", 0),
+    _Column("pose", "right", 110),
+    _Column("height", "right", 0),
+    _Column("battery", "right", 0),
+    _Column("mode", "right", 90),
+    _Column("own area", "right", 120),
+    _Column("sent", "right", 120),
+    _Column("rate", "right", 100),
+    _Column("age", "right", 0),
+    _Column("hears", "left", 100),
+    _Column("why", "left", 0),
+)
 _SEVERITY_STYLE = {"info": "dim", "warning": "yellow", "error": "bold red"}
 
 
-def render(snapshot: FleetSnapshot) -> RenderableType:
-    """Return a snapshot as one line of figures, a row per drone, and the latest events, for rich to show."""
+def render(snapshot: FleetSnapshot, width: int = 140) -> RenderableType:
+    """Return a snapshot as one line of figures, a row per drone, and the latest events, for rich to show.
+
+    Where `width` characters are too few for all columns, those that a pilot needs least are left out.
+    """
+    shown = [column for column in _COLUMNS if width >= column.from_width]
     table = Table(box=None, header_style="dim", pad_edge=False, expand=False)
-    for name in ("drone", "state"):
-        table.add_column(name, no_wrap=True)
-    for name in ("pose", "height", "battery", "mode", "own area", "sent", "rate", "age"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("hears", no_wrap=True)
-    table.add_column("why", overflow="fold", ratio=1)
+    for column in shown:
+        if column.name == "why":
+            table.add_column("why", overflow="fold", ratio=1)
+        else:
+            table.add_column(column.name, justify=column.justify, no_wrap=True)
     for drone in snapshot.drones:
-        table.add_row(*_row(drone, snapshot.map.cell_m), style="red" if drone.stale else "")
+        cells = dict(zip((c.name for c in _COLUMNS), _row(drone, snapshot.map.cell_m), strict=True))
+        table.add_row(*(cells[column.name] for column in shown), style="red" if drone.stale else "")
     events = [_event(event) for event in snapshot.events[-_EVENTS_SHOWN:]]
     return Group(_headline(snapshot), table, *events)
 

@@ -46,6 +46,7 @@ def state_since(snapshot: FleetSnapshot, client: ClientView) -> dict[str, Any]:
         "links": snapshot.links,
         "command": None if snapshot.command is None else asdict(snapshot.command),
         "dropped_datagrams": snapshot.dropped_datagrams,
+        "over": snapshot.over,
         "events": [asdict(event) for event in snapshot.events if event.serial > client.event_serial],
         "map": {
             "version": view.version,

@@ -103,7 +103,7 @@ def fly(
 ) -> None:
     """Fly the team: with --sim in the twin on this machine, with --vehicle one real (or served) drone."""
     if sim == (vehicle is not None or config is not None):
-        raise InputError("fly: give --sim to fly in the twin, or --vehicle URL and --lidar URL on a drone")
+        raise InputError("fly: give either --sim to fly in the twin, or --vehicle URL and --lidar URL on a drone")
     check_outputs(json_file, map_file)
     sources = {name: context.get_parameter_source(name) for name in context.params}
     given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+
 from imagine.gcs.fleet import Fleet
-from imagine.gcs.server import GroundServer
+from imagine.gcs.server import PUSH_PERIOD_S, GroundServer
 from imagine.gcs.snapshot import FleetSnapshot
 from imagine.gcs.station import obey
 from imagine.mesh_comm.messages import GROUND
@@ -46,6 +49,11 @@ class FlightGround:
         snapshot = self.fleet.snapshot(now, coverage)
         self.server.publish(snapshot)
         return snapshot
+
+    def finish(self, time_s: float, coverage: float, ending: str) -> None:
+        """Leave a last word on the page, and the time for it to arrive before the server goes."""
+        self.server.publish(replace(self.fleet.snapshot(time_s, coverage), over=ending))
+        time.sleep(2.0 * PUSH_PERIOD_S)
 
     def _note_failures(self, record: TickRecord, processes: RunnerProcesses) -> None:
         """Tell the pilot what only the twin can see: why a drone went silent and what its vehicle does about it."""

@@ -41,7 +41,7 @@ class _Screen(Watcher):
     def tick(self, record: TickRecord, coverage: float, snapshot: FleetSnapshot | None) -> None:
         if self._live is not None:
             if snapshot is not None:
-                self._live.update(render(snapshot), refresh=True)
+                self._live.update(render(snapshot, self._console.width), refresh=True)
         elif record.tick % _LINE_TICKS == _LINE_TICKS - 1:
             states = "  ".join(f"D{v.drone} {v.mode.name.lower()} {v.height_m:.1f} m" for v in record.vehicles)
             self._console.print(f"{record.time_s:6.1f} s  coverage {coverage:6.1%}  {states}", highlight=False)
@@ -84,12 +84,21 @@ def fly_in_twin(
             found = fly_sim(options, processes, _Screen(console, live), began)
     else:
         found = fly_sim(options, processes, _Screen(console, None), began)
-    write_json(json_file, found)
     _show(console, found)
+    write_json(json_file, found)
     sys.stdout.flush()
-    failed = [f"drone {drone['id']}: {drone['error']}" for drone in found["drones"] if drone["error"]]
-    if failed:
+    if failed := failures(found["drones"]):
         raise WorkError("; ".join(failed))
+
+
+def failures(drones: list[dict[str, Any]]) -> list[str]:
+    """Return in words why each of the flight's drones failed: its process died, or its runner's failsafe ended it."""
+    found = []
+    for drone in drones:
+        failsafe = "; ".join(f"failsafe: {f['text']}" for f in drone["failsafes"] if f["kind"] == "runner")
+        if why := drone["error"] or failsafe:
+            found.append(f"drone {drone['id']}: {why}")
+    return found
 
 
 def _show(console: Console, found: dict[str, Any]) -> None:
@@ -110,11 +119,7 @@ def _show(console: Console, found: dict[str, Any]) -> None:
         error, tick_ms = drone["pose_rmse_m"], drone["tick_ms"]
         table.add_row(
             f"D{drone['id']}",
-            f"{drone['distance_m']:.1f} m",
-            str(drone["own_cells"]),
-            str(drone["scan_cells"]),
-            str(drone["map_cells"]),
-            f"{sum(drone['bytes_sent'].values()) / 1000:.0f} kB",
+            *_known(drone),
             "unknown" if error is None else f"{error:.3f} m",
             "unknown" if tick_ms is None else f"{tick_ms['p99']:.0f} ms",
         )
@@ -124,6 +129,15 @@ def _show(console: Console, found: dict[str, Any]) -> None:
     console.print(table, highlight=False)
     for ending, names in endings.items():
         console.print(f"{', '.join(names)}: {ending}", highlight=False, markup=False)
+
+
+def _known(drone: dict[str, Any]) -> tuple[str, ...]:
+    """Return distance, cells and bytes in words; a drone that was killed left none."""
+    if drone["distance_m"] is None:
+        return ("lost",) + ("",) * 4
+    sent = sum(drone["bytes_sent"].values()) / 1000
+    cells = (str(drone[kind]) for kind in ("own_cells", "scan_cells", "map_cells"))
+    return (f"{drone['distance_m']:.1f} m", *cells, f"{sent:.0f} kB")
 
 
 def _reached(tick: int | None) -> str:

@@ -109,6 +109,11 @@ def fly_sim(options: FlyOptions, processes: RunnerProcesses, watcher: Watcher, b
         processes.request_end()
         processes.wait_end()
         found = flight.results()
+        if ground is not None and flight.log.last is not None:
+            last = flight.log.last
+            down = sum(not vehicle.armed for vehicle in last.vehicles)
+            ending = f"Flight over: coverage {found['coverage']:.1%}, {down} of {options.drones} drones are down."
+            ground.finish(last.time_s, found["coverage"], ending)
         if options.map_image is not None:
             draw_flown_map(processes, options.drones, options.map_image)
         return found

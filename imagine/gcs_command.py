@@ -31,6 +31,6 @@ def watch_fleet(
             settings,
             key,
             lambda url: live.console.print(f"ground station: {url}"),
-            lambda snapshot: live.update(render(snapshot), refresh=True),
+            lambda snapshot: live.update(render(snapshot, live.console.width), refresh=True),
             threading.Event(),
         )

@@ -1,7 +1,8 @@
 """Where numba keeps compiled kernels: a folder of its own for every state of the kernels' sources.
 
 Numba notices a change in the file of a cached function, but not in the files of the functions it calls. A kernel of
-the twin would go on flying an old map kernel, silently. Naming the folder after all kernel sources prevents that.
+the twin would go on flying an old map kernel, silently. Naming the folder after all kernel sources, and whatever
+they may take constants from, prevents that.
 """
 
 from __future__ import annotations
@@ -22,14 +23,8 @@ def use_kernel_cache() -> None:
     """
     if "NUMBA_CACHE_DIR" in os.environ:
         return
-    package = Path(__file__).resolve().parent
-    digest = hashlib.sha256(str(package).encode())
-    for source in sorted(package.glob("*/*.py")):
-        text = source.read_bytes()
-        if b"njit" in text:
-            digest.update(text)
     root = _cache_root()
-    folder = root / digest.hexdigest()[:16]
+    folder = root / kernel_digest(Path(__file__).resolve().parent)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
@@ -37,6 +32,17 @@ def use_kernel_cache() -> None:
     except OSError:
         folder = Path(tempfile.mkdtemp(prefix="imagine-kernels-"))
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
+
+
+def kernel_digest(package: Path) -> str:
+    """Return a name for the state of a package's kernels: its place and every source that they are compiled from."""
+    digest = hashlib.sha256(str(package).encode())
+    for source in sorted(package.glob("*/*.py")):
+        text = source.read_bytes()
+        # constants of files without kernels are frozen into the kernels of those that import them
+        if source.parent.name in ("core", "sim") or b"njit" in text:
+            digest.update(text)
+    return digest.hexdigest()[:16]
 
 
 def _cache_root() -> Path:

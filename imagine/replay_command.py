@@ -13,7 +13,8 @@ from imagine.onboard.replay import replay_file
 
 def replay_and_show(recording: Path, json_file: Path | None, map_file: Path | None, verify: bool) -> None:
     """Replay a LiDAR recording, write what is wanted, and print the outcome."""
-    with Progress(transient=True, console=Console(stderr=True)) as bar:
+    console = Console(stderr=True)
+    with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(recording.name, total=None)
         result = replay_file(
             recording,

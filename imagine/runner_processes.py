@@ -69,7 +69,11 @@ class RunnerProcesses:
         for drone in settings:
             number = drone.drone_id
             wired = drone.model_copy(
-                update={"report": self._file(number, "json"), "map_out": self._file(number, "npz")}
+                update={
+                    "report": self._file(number, "json"),
+                    "map_out": self._file(number, "npz"),
+                    "boot_file": self._file(number, "boot"),  # the key is new, so no number has been used with it
+                }
             )
             self._file(number, "yaml").write_text(wired.model_dump_json(), encoding="utf-8")  # JSON is YAML
             tether = self._processes[number].stdin

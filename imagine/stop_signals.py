@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM during a flight: the first lands the drones, the second ends the command at once."""
+"""Ctrl-C, SIGTERM or a closed terminal in flight: the first lands the drones, the second ends the command at once."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 class StopSignals:
-    """While entered, turns SIGINT and SIGTERM into KeyboardInterrupt until `flying` is set, then into `requested`.
+    """While entered, turns the signals into KeyboardInterrupt until `flying` is set, then into `requested`.
 
     Before takeoff there is nothing to land; in flight the first signal only sets `requested`, a second interrupts.
     """
@@ -28,7 +30,7 @@ class StopSignals:
 
     def __enter__(self) -> StopSignals:
         if threading.current_thread() is threading.main_thread():  # no other thread gets signals
-            self._before = {n: signal.signal(n, self._take) for n in (signal.SIGINT, signal.SIGTERM)}
+            self._before = {n: signal.signal(n, self._take) for n in _SIGNALS}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:

@@ -67,32 +67,40 @@ def find_key(path: Path | None, environ: Mapping[str, str]) -> bytes:
     raise InputError(f"no mesh key: name a key file or set {KEY_VARIABLE}; make one with `imagine keygen`")
 
 
-def boot_number(unix_time_s: float) -> int:
-    """Return the boot number that the clock alone gives: seconds since 2020, at least 0."""
-    return max(0, int(unix_time_s) - _EPOCH_S)
+def default_boot_file(node: int) -> Path:
+    """Return where drone `node` remembers its boot number unless told otherwise."""
+    return Path(f"~/.imagine/drone-{node}.boot")
 
 
 def next_boot_number(path: Path, unix_time_s: float) -> int:
     """Return a number greater than at any earlier start, and remember it in the file `path`.
 
-    The clock keeps numbers growing when the file is lost, the file when the clock is wrong. Raises InputError if the
-    file is damaged or cannot be written, since a repeated number would break the seal.
+    The clock (seconds since 2020) keeps numbers growing when the file is lost, the file when the clock is wrong. A
+    leading `~` is the home folder; the file's folder is made if need be. Raises InputError if the file is damaged or
+    cannot be written, since a repeated number would break the seal.
     """
     last = 0
+    try:
+        path = path.expanduser()
+    except RuntimeError as error:
+        raise InputError(f"{path}: no such home folder; set boot_file to a file that can be written") from error
     try:
         last = int(path.read_text(encoding="ascii")) if path.exists() else 0
     except ValueError as error:
         raise InputError(f"{path}: does not hold a boot number; remove it if the clock is right") from error
     except OSError as error:
         raise InputError(f"{path}: the boot number cannot be read: {error.strerror}") from error
-    boot = max(last + 1, boot_number(unix_time_s))
+    boot = max(last + 1, int(unix_time_s) - _EPOCH_S)
     fresh = path.with_name(path.name + ".new")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with fresh.open("w", encoding="ascii") as file:
             file.write(f"{boot}\n")
             file.flush()
             os.fsync(file.fileno())
         fresh.replace(path)
     except OSError as error:
-        raise InputError(f"{path}: the boot number cannot be written: {error.strerror}") from error
+        raise InputError(
+            f"{path}: the boot number cannot be written: {error.strerror}; set boot_file to a file that can be"
+        ) from error
     return boot

@@ -6,22 +6,21 @@ import logging
 import math
 import select
 import socket
-import struct
 import time
 from collections import deque
 from typing import Protocol
 from urllib.parse import urlsplit
 
 from imagine.core.errors import InputError
+from imagine.mesh_comm.markers import decode_marker, encode_marker
 
 _log = logging.getLogger(__name__)
 
 HELLO = b"IMHI"
 """Sent to a radio modem so that it learns the node's address; carries nothing."""
-MARKER_MAGIC = b"IMTK"
-_MARKER = struct.Struct("<4sd")
 _INBOX = 2048  # datagrams kept while nobody reads: the oldest go first
 _READ_BYTES = 65535
+_MOST_READS = 1000  # in one go, so that a flood cannot hold the loop
 _HELLO_PERIOD_S = 0.5
 _TICK_TOLERANCE_S = 1e-6
 
@@ -109,14 +108,15 @@ class UdpModemLink:
         """Send one datagram to the modem; one the system refuses is counted as lost."""
         try:
             self._socket.send(datagram)
-        except (BlockingIOError, ConnectionRefusedError):
+        except OSError:  # as with a broadcast radio: losing a datagram must not end the runner
             self.lost += 1
 
     def receive(self) -> list[bytes]:
         """Return the datagrams that have arrived, markers left out."""
         if not self._is_lockstep:
-            while self._read():
-                pass
+            for _ in range(_MOST_READS):
+                if not self._read():
+                    break
         self._greet()
         arrived = list(self._inbox)
         self._inbox.clear()
@@ -124,14 +124,14 @@ class UdpModemLink:
 
     def send_marker(self, stamp: float) -> None:
         """Tell the twin that everything of the tick `stamp` (seconds) has been sent."""
-        self.send(_MARKER.pack(MARKER_MAGIC, stamp))
+        self.send(encode_marker(stamp))
 
     def wait_marker(self, stamp: float, timeout_s: float) -> bool:
         """Wait until the twin's marker of tick `stamp` or a later one has come; tell whether it came in time."""
         self._is_lockstep = True
         deadline = time.monotonic() + timeout_s
         while self._marker < stamp - _TICK_TOLERANCE_S:
-            if self._read():
+            if self._read() and time.monotonic() < deadline:
                 continue
             self._greet()
             left = deadline - time.monotonic()
@@ -154,12 +154,12 @@ class UdpModemLink:
             datagram = self._socket.recv(_READ_BYTES)
         except BlockingIOError:
             return False
-        except ConnectionRefusedError:  # nobody at the modem's port yet, or no longer
+        except OSError:  # nobody at the modem's port yet, or no longer, or no network
             self.lost += 1
             return True
         self._is_heard = True
-        if datagram[:4] == MARKER_MAGIC and len(datagram) == _MARKER.size:
-            _, stamp = _MARKER.unpack(datagram)
+        stamp = decode_marker(datagram)
+        if stamp is not None:
             if math.isfinite(stamp):
                 self._marker = max(self._marker, stamp)
         elif datagram and datagram != HELLO:

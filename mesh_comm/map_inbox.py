@@ -10,6 +10,7 @@ from imagine.core.evidence import EvidenceMap
 from imagine.core.frames import Pose
 from imagine.core.raster import CELL
 from imagine.mesh_comm import messages
+from imagine.mesh_comm.codec import unpack_tile
 from imagine.mesh_comm.messages import Tiles, tile_key
 from imagine.mesh_comm.provenance import KnownCells
 from imagine.mesh_comm.scan_exchange import draw_peer_scan
@@ -47,11 +48,11 @@ class MapInbox:
         """
         self._check_source(message.source)
         for tile in message.tiles:
-            key = tile_key(tile)
+            key, cells = tile_key(tile), unpack_tile(tile.packed)
             if is_source_near and self._evidence.is_provisional(message.source, key):
                 continue
             self.own_cells += self._known.claim_tile(key)
-            if self._exchange.merge(message.source, tile):
+            if self._exchange.merge(message.source, tile, cells):
                 self.map_cells += self._known.claim_tile(key)
 
     def outgrow(self, version: int) -> None:

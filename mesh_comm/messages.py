@@ -27,10 +27,14 @@ POSITION_LIMIT_M = MAX_TILES * TILE * CELL / 2
 """A position further than this from the origin cannot be in any map and is refused."""
 MAX_BEAMS = 4096
 MAX_RANGE_CAP_M = 30.0
+MAX_SPEED_MPS = 50.0
+_MAX_HEIGHT_M = 1000.0
+_MAX_YAW_RAD = 1e4  # senders may leave turns unwrapped
+_MAX_TIME_S = 1e10
 
 NodeId = Annotated[int, Meta(ge=0, le=254)]
 SourceId = Annotated[int, Meta(ge=1, le=254)]
-Count = Annotated[int, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=0, le=2**53)]
 Clock = Annotated[int, Meta(ge=0, le=2**31)]
 Tag = Annotated[str, Meta(max_length=32)]
 Column = Annotated[int, Meta(ge=-MAX_TILES, le=MAX_TILES)]
@@ -122,7 +126,7 @@ class Command(Struct, tag=5, array_like=True, frozen=True):
 
     action: Tag
     target: NodeId
-    nonce: Annotated[int, Meta(ge=1)]
+    nonce: Annotated[int, Meta(ge=1, le=2**53)]
 
 
 ACTIONS = ("hold", "land", "resume")
@@ -178,12 +182,14 @@ def _check(message: Message) -> None:
                 raise InputError(f"mesh scan: increment {message.increment} rad with {message.beams} beams")
             if not (abs(message.start) <= turn and 0.0 < message.range_cap_m <= MAX_RANGE_CAP_M):
                 raise InputError(f"mesh scan: start {message.start} rad, range cap {message.range_cap_m} m")
-            _check_finite("scan", message.stamp)
+            _check_bounds("scan: stamp", _MAX_TIME_S, message.stamp)
         case Status():
             _check_pose(message.pose)
-            _check_finite("status", message.stamp, *message.velocity, message.height_m, *message.links.values())
+            _check_bounds("status: time", _MAX_TIME_S, message.stamp, *message.links.values())
+            _check_bounds("status: velocity", MAX_SPEED_MPS, *message.velocity, math.hypot(*message.velocity))
+            _check_bounds("status: height", _MAX_HEIGHT_M, message.height_m)
         case Digest():
-            _check_finite("digest", message.stamp)
+            _check_bounds("digest: stamp", _MAX_TIME_S, message.stamp)
         case Command():
             if message.action not in ACTIONS:
                 raise InputError(f"mesh command '{message.action}', expected one of {', '.join(ACTIONS)}")
@@ -191,12 +197,11 @@ def _check(message: Message) -> None:
             pass  # each tile's cells are checked when they are unpacked
 
 
-def _check_finite(what: str, *values: float) -> None:
-    if not all(map(math.isfinite, values)):
-        raise InputError(f"mesh {what} holds a number that is not finite")
+def _check_bounds(what: str, most: float, *values: float) -> None:
+    if not all(abs(value) <= most for value in values):  # nan is not, either
+        raise InputError(f"mesh {what} {', '.join(map(str, values))}, expected at most {most:g} either way")
 
 
 def _check_pose(pose: Pose) -> None:
-    _check_finite("pose", *pose)
-    if max(abs(pose.x), abs(pose.y)) > POSITION_LIMIT_M:
-        raise InputError(f"mesh pose ({pose.x:.1f}, {pose.y:.1f}) m lies further than {POSITION_LIMIT_M:.0f} m out")
+    _check_bounds("pose: position", POSITION_LIMIT_M, pose.x, pose.y)
+    _check_bounds("pose: yaw", _MAX_YAW_RAD, pose.yaw)

@@ -15,6 +15,7 @@ from imagine.core.frames import Pose
 from imagine.core.lidar import LidarSpec, Scan, mask_near
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.budget import TokenBucket
+from imagine.mesh_comm.codec import unpack_tile
 from imagine.mesh_comm.digest import digests
 from imagine.mesh_comm.map_inbox import MapInbox
 from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Command, Digest, Message, Status, Tiles, tile_key
@@ -127,13 +128,17 @@ class MeshNode:
     def _take_tiles(self, message: Tiles, peer: PeerRecord, now: float) -> None:
         source = message.source
         is_relayed = source != peer.id
-        for tile in message.tiles:
+        if source == self.id:
+            for tile in message.tiles:
+                unpack_tile(tile.packed)
+        elif is_relayed and self.settings.protocol == "one-hop" and self.id != GROUND:
+            return
+        else:
+            self._maps.take_tiles(message, is_relayed and self._peers.is_live(source, now))
+        for tile in message.tiles:  # only now that all of it has proved sound: what is noted is kept
             peer.note_held(source, tile_key(tile), tile.version)
             if source != self.id:
                 self._exchange.note_overheard(source, tile, now)
-        if source == self.id or (is_relayed and self.settings.protocol == "one-hop" and self.id != GROUND):
-            return
-        self._maps.take_tiles(message, is_relayed and self._peers.is_live(source, now))
 
     def _drop(self, reason: str, sender: int, error: InputError) -> None:
         self._dropped[reason] += 1

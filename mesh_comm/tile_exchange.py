@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from imagine.core.evidence import EvidenceMap, TileKey
-from imagine.mesh_comm.codec import pack_tile, unpack_tile
+from imagine.mesh_comm.codec import pack_tile
 from imagine.mesh_comm.messages import GROUND, Tile, Tiles, tile_key
 from imagine.mesh_comm.peers import PeerRecord
 from imagine.mesh_comm.settings import MeshSettings
@@ -47,13 +50,13 @@ class TileExchange:
         self._sent: dict[tuple[int, TileKey], _Sent] = {}
         self._queue: list[_Wanted] = []
 
-    def merge(self, source: int, tile: Tile) -> bool:
+    def merge(self, source: int, tile: Tile, cells: NDArray[np.int8]) -> bool:
         """Take a tile heard from a peer if it is newer than what is held; tell whether it was taken.
 
-        Raises InputError on damaged cells and on a tile too far away to hold.
+        `cells` int8 `[TILE, TILE]`, unpacked from the tile. Raises InputError on a tile too far away to hold.
         """
         key = tile_key(tile)
-        if not self._evidence.merge_tile(source, key, tile.version, unpack_tile(tile.packed)):
+        if not self._evidence.merge_tile(source, key, tile.version, cells):
             return False
         # kept apart from the layer: scans drawn ahead of the next version must not be passed on
         self._confirmed.setdefault(source, {})[key] = Held(tile.version, tile.packed)

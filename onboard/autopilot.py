@@ -67,6 +67,7 @@ class VirtualAutopilot:
             stamp=self.now,
             yaw=self.yaw,
             height_m=self.height,
+            ranged=True,
             landed=self.height <= 0.0,
             position_ok=self._odometry is not None,
             acks=acks,

@@ -14,7 +14,7 @@ from imagine.core.observation import observe
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.planner import plan_velocity
 from imagine.core.shield import shield_velocity
-from imagine.mesh_comm.keys import boot_number, find_key, next_boot_number
+from imagine.mesh_comm.keys import default_boot_file, find_key, next_boot_number
 from imagine.mesh_comm.node import MeshNode
 from imagine.mesh_comm.seal import KEY_BYTES, Sealer
 from imagine.onboard.perception import Perception
@@ -47,15 +47,15 @@ def load_policy(settings: DroneSettings) -> OnnxPolicy | None:
 
 
 def mesh_sealer(settings: DroneSettings, environ: Mapping[str, str], unix_time_s: float) -> Sealer | None:
-    """Return the seal of this drone's mesh messages, None without mesh. Raises InputError without a key."""
+    """Return the seal of this drone's mesh messages, None without mesh.
+
+    Raises InputError without a key, and where the boot number cannot be remembered.
+    """
     if settings.mesh is None:
         return None
     key = find_key(settings.key_file, environ)
-    if settings.boot_file is not None:
-        boot = next_boot_number(settings.boot_file, unix_time_s)
-    else:
-        boot = boot_number(unix_time_s)
-    return Sealer(key, settings.drone_id, boot)
+    boot_file = settings.boot_file or default_boot_file(settings.drone_id)
+    return Sealer(key, settings.drone_id, next_boot_number(boot_file, unix_time_s))
 
 
 def warm_up(settings: DroneSettings, policy: Policy | None) -> None:

@@ -99,7 +99,13 @@ class Estimator:
         if not (np.isfinite(z).all() and np.isfinite(covariance).all()):
             return self._refuse("odometry is not finite")
         innovation = _residual(z, f.x[:3])
-        distance = math.sqrt(innovation @ np.linalg.solve(f.P[:3, :3] + covariance, innovation))
+        try:
+            square = float(innovation @ np.linalg.solve(f.P[:3, :3] + covariance, innovation))
+        except np.linalg.LinAlgError:
+            square = math.nan
+        if not 0.0 <= square < math.inf:  # rounding, or a covariance that is none, made it meaningless
+            return self._refuse("odometry's distance from the estimate cannot be told")
+        distance = math.sqrt(square)
         if distance > s.gate:
             off = math.hypot(innovation[0], innovation[1])
             return self._refuse(

@@ -30,9 +30,17 @@ def _load_filter() -> Any:
         functions = importlib.import_module("filterpy.common.helpers")
         stand_ins["filterpy.common"].__dict__.update(pretty_str=functions.pretty_str, reshape_z=functions.reshape_z)
         return importlib.import_module("filterpy.kalman.EKF").ExtendedKalmanFilter
+    except (ImportError, AttributeError):  # another filterpy, laid out otherwise: load the whole of it
+        pass
     finally:
-        for name in [name for name in sys.modules if name.partition(".")[0] == "filterpy"]:
-            del sys.modules[name]
+        _forget()
+    return importlib.import_module("filterpy.kalman").ExtendedKalmanFilter
+
+
+def _forget() -> None:
+    """Take filterpy and its stand-ins out of the loaded modules."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "filterpy"]:
+        del sys.modules[name]
 
 
 def _logpdf(*args: Any, **kwargs: Any) -> Any:

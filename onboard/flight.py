@@ -8,49 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 
+from imagine.onboard.phases import TAKEOFFS, Phase
 from imagine.onboard.records import Event, FlightMode, Telemetry, VehicleCommand
 from imagine.onboard.settings import FlightSettings
 
 _TELEMETRY_FRESH_S = 0.5
 _HEIGHT_REACHED_M = 0.1
+_HELD = "held on the ground by the pilot"
+_DISARMED_S = 2.0  # an autopilot may obey the arming late: disarmed is what has stayed disarmed for so long
 _TRACKED_TICKS = 5
 """So many scans tracked in a row before takeoff, half a second: the map hangs on the first ones."""
-
-
-class Phase(StrEnum):
-    """Where a flight stands. RELEASED: the autopilot or a pilot has the vehicle, the runner is silent for good."""
-
-    PREPARE = "prepare"
-    OFFBOARD = "offboard"
-    ARM = "arm"
-    CLIMB = "climb"
-    EXPLORE = "explore"
-    LAND = "land"
-    DONE = "done"
-    RELEASED = "released"
-    FAILED = "failed"
-
-
-AIRBORNE = frozenset({Phase.CLIMB, Phase.EXPLORE, Phase.LAND})
-FINAL = frozenset({Phase.DONE, Phase.RELEASED, Phase.FAILED})
-
-
-@dataclass(frozen=True)
-class Takeoff:
-    """How one make of autopilot is brought into the air: the phases in order, the stream it wants before OFFBOARD.
-
-    PX4 takes OFFBOARD only with setpoints streaming, arms in it, and climbs by velocity.
-    """
-
-    phases: tuple[Phase, ...]
-    needs_stream: bool
-
-
-TAKEOFFS: dict[str, Takeoff] = {
-    "px4": Takeoff((Phase.PREPARE, Phase.OFFBOARD, Phase.ARM, Phase.CLIMB, Phase.EXPLORE), needs_stream=True),
-}
 
 
 @dataclass(frozen=True)
@@ -81,6 +49,8 @@ class Flight:
         self._tracked_ticks = 0
         self._events: list[Event] = []
         self._airborne_since: float | None = None
+        self._disarmed_since: float | None = None
+        self._after_disarm = Phase.DONE
 
     def airborne_s(self, now: float) -> float:
         """Return for how long the vehicle has been flying, 0 before takeoff."""
@@ -97,7 +67,7 @@ class Flight:
         """Advance by one tick.
 
         `tracked`: a fresh scan was tracked. `land_reason`: the ladder, or the pilot, wants the vehicle down.
-        `may_start` false keeps it on the ground.
+        `may_start` false keeps it on the ground, and takes back a start that has not left it.
         """
         self._events = []
         self._since = now if self._since is None else self._since
@@ -108,8 +78,9 @@ class Flight:
             self._listen(now, telemetry)
             step: dict[Phase, Callable[[], tuple[VehicleCommand, ...]]] = {
                 Phase.PREPARE: lambda: self._prepare(now, telemetry, fresh, land_reason, may_start),
-                Phase.OFFBOARD: lambda: self._request_offboard(now, telemetry, land_reason),
-                Phase.ARM: lambda: self._arm(now, telemetry, land_reason),
+                Phase.OFFBOARD: lambda: self._request_offboard(now, telemetry, land_reason, may_start),
+                Phase.ARM: lambda: self._arm(now, telemetry, land_reason, may_start),
+                Phase.DISARM: lambda: self._disarm(now, telemetry, fresh, land_reason),
                 Phase.CLIMB: lambda: self._climb(now, telemetry, land_reason),
                 Phase.EXPLORE: lambda: self._explore(now, telemetry, land_reason),
                 Phase.LAND: lambda: self._land(now, telemetry),
@@ -121,7 +92,8 @@ class Flight:
         streams = self.phase not in (Phase.RELEASED, Phase.FAILED)
         if streams and tracked and self._stream_since is None:
             self._stream_since = now
-        return FlightStep(self.phase, self.reason, commands, self._climb_speed(telemetry), streams, tuple(self._events))
+        vz = self._climb_speed(telemetry) if telemetry is not None and fresh else 0.0
+        return FlightStep(self.phase, self.reason, commands, vz, streams, tuple(self._events))
 
     def _listen(self, now: float, telemetry: Telemetry) -> None:
         for ack in telemetry.acks:
@@ -152,7 +124,7 @@ class Flight:
             if not there
         ]
         if not may_start:
-            self.reason = "held on the ground by the pilot"
+            self.reason = _HELD
             self._since = now
         elif missing:
             self.reason = "waiting for " + ", ".join(missing)
@@ -164,10 +136,13 @@ class Flight:
         return ()
 
     def _request_offboard(
-        self, now: float, telemetry: Telemetry, land_reason: str | None
+        self, now: float, telemetry: Telemetry, land_reason: str | None, may_start: bool
     ) -> tuple[VehicleCommand, ...]:
         if land_reason is not None:
             return self._stay_down(now, telemetry, land_reason)
+        if not may_start:
+            self._enter(Phase.PREPARE, now, _HELD)
+            return ()
         if telemetry.mode is FlightMode.OFFBOARD:
             self._advance(now, "arming")
             return self._ask(VehicleCommand.ARM, now)
@@ -176,19 +151,48 @@ class Flight:
             return ()
         return self._ask(VehicleCommand.OFFBOARD, now)
 
-    def _arm(self, now: float, telemetry: Telemetry, land_reason: str | None) -> tuple[VehicleCommand, ...]:
+    def _arm(
+        self, now: float, telemetry: Telemetry, land_reason: str | None, may_start: bool
+    ) -> tuple[VehicleCommand, ...]:
         if land_reason is not None:
-            return self._stay_down(now, telemetry, land_reason)
+            return self._take_back(now, land_reason, Phase.DONE)
+        if not may_start:
+            return self._take_back(now, _HELD, Phase.PREPARE)
         if telemetry.armed and telemetry.mode is FlightMode.OFFBOARD:
             self._airborne_since = now
             self._advance(now, f"climbing to {self.settings.height_m:.1f} m")
             return ()
         if self._overdue(now, self.settings.arm_deadline_s):
-            self._enter(Phase.FAILED, now, f"the autopilot does not arm{self._answer}")
-            return ()
+            return self._take_back(now, f"the autopilot does not arm{self._answer}", Phase.FAILED)
         if telemetry.mode is not FlightMode.OFFBOARD:
             return self._ask(VehicleCommand.OFFBOARD, now)
         return self._ask(VehicleCommand.ARM, now)
+
+    def _take_back(self, now: float, reason: str, then: Phase) -> tuple[VehicleCommand, ...]:
+        """Disarm: arming was asked for, and may yet be obeyed."""
+        self._after_disarm, self._disarmed_since = then, None
+        self._enter(Phase.DISARM, now, reason)
+        return self._ask(VehicleCommand.DISARM, now)
+
+    def _disarm(
+        self, now: float, telemetry: Telemetry, fresh: bool, land_reason: str | None
+    ) -> tuple[VehicleCommand, ...]:
+        if land_reason is not None and self._after_disarm is Phase.PREPARE:  # a hold that becomes a landing
+            self._after_disarm, self.reason = Phase.DONE, land_reason
+        if telemetry.armed or not fresh:
+            self._disarmed_since = None
+        elif self._disarmed_since is None:
+            self._disarmed_since = now
+        if self._disarmed_since is not None and now - self._disarmed_since >= _DISARMED_S - 1e-6:
+            self._enter(self._after_disarm, now, self.reason)
+            return ()
+        if telemetry.armed and telemetry.mode in (FlightMode.POSITION, FlightMode.MANUAL):
+            self._release(now, f"a pilot has the vehicle in {telemetry.mode.value}")
+            return ()
+        if self._overdue(now, self.settings.land_deadline_s):
+            self._release(now, f"not seen disarmed for {self.settings.land_deadline_s:.0f} s: left to the autopilot")
+            return ()
+        return self._ask(VehicleCommand.DISARM, now)
 
     def _climb(self, now: float, telemetry: Telemetry, land_reason: str | None) -> tuple[VehicleCommand, ...]:
         if self._left(now, telemetry):
@@ -265,9 +269,9 @@ class Flight:
     def _overdue(self, now: float, deadline_s: float) -> bool:
         return self._since is not None and now - self._since > deadline_s
 
-    def _climb_speed(self, telemetry: Telemetry | None) -> float:
-        """Proportional height control by climb speed, once armed and until landing."""
-        if telemetry is None or self.phase not in (Phase.CLIMB, Phase.EXPLORE):
+    def _climb_speed(self, telemetry: Telemetry) -> float:
+        """Proportional height control by climb speed, once armed and until landing; none by an old height."""
+        if self.phase not in (Phase.CLIMB, Phase.EXPLORE) or telemetry.height_age_s > _TELEMETRY_FRESH_S:
             return 0.0
         s = self.settings
         # Taking off at a crawl would leave ground effect and landing gear late: full climb until close.

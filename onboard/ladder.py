@@ -42,6 +42,7 @@ class Situation:
 
     `policy` and `frontier` are the velocities the two propose; None: the policy failed (`policy_failure` says how) or
     is absent, no frontier is in reach. `lost_s`: since a scan was last tracked. `silent_s`: age of the telemetry.
+    `height_age_s`: since a rangefinder that had been heard fell silent.
     """
 
     now: float
@@ -60,6 +61,7 @@ class Situation:
     ending: bool = False
     exploring: bool = True
     has_scan: bool = True
+    height_age_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,8 @@ class Ladder:
             return Decision(Decider.LAND, STILL, f"lost for {s.lost_s:.1f} s: {s.lost_reason}", failsafe=True)
         if s.silent_s > c.lost_land_s:
             return Decision(Decider.LAND, STILL, f"no telemetry for {s.silent_s:.1f} s", failsafe=True)
+        if s.height_age_s > c.lost_land_s:
+            return Decision(Decider.LAND, STILL, f"no height for {s.height_age_s:.1f} s", failsafe=True)
         if s.airborne_s > self.max_flight_s:
             return Decision(Decider.LAND, STILL, f"flown for {self.max_flight_s:.0f} s, the longest allowed")
         return None

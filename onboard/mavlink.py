@@ -10,6 +10,7 @@ import logging
 import math
 import select
 import socket
+import struct
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -32,6 +33,7 @@ VELOCITY_AND_YAW_RATE = 0x5C7
 _PX4_OFFBOARD = 6
 _READ_BYTES = 65535
 _MOST_DATAGRAMS = 500  # in one go, so that a flood cannot hold the loop
+_PEER_SILENT_S = 2.0  # only then may the vehicle speak from another address
 _MAGIC_V2, _MAGIC_V1 = 0xFD, 0xFE
 
 
@@ -46,6 +48,7 @@ class MavlinkAutopilot:
         self.system = system
         self.dropped: dict[str, int] = {"malformed": 0, "foreign": 0, "unsent": 0}
         self._peer: tuple[str, int] | None = None
+        self._peer_at = -math.inf
         self._socket = self._open(url)
         self._codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=ONBOARD_COMPUTER)
         self._assembler = TelemetryAssembler(clock)
@@ -104,7 +107,9 @@ class MavlinkAutopilot:
         _, _, yaw_rate = ned.swap_flu_frd(0.0, 0.0, odometry.yaw_rate)
         level = math.radians(2.0) ** 2  # roll and pitch are not estimated here: the vehicle flies level
         position, velocity = odometry.position_variance, odometry.velocity_variance
-        if not all(map(math.isfinite, (x, y, z, half, vx, vy, vz, yaw_rate, position, velocity))):
+        height, yaw = odometry.height_variance, odometry.yaw_variance
+        numbers = (odometry.stamp, x, y, z, half, vx, vy, vz, yaw_rate, position, velocity, height, yaw)
+        if not all(map(math.isfinite, numbers)):
             self.dropped["unsent"] += 1
             return
         self._send(
@@ -113,7 +118,7 @@ class MavlinkAutopilot:
                 mavlink.MAV_FRAME_LOCAL_FRD,
                 mavlink.MAV_FRAME_BODY_FRD,
                 x, y, z, [math.cos(half), 0.0, 0.0, math.sin(half)], vx, vy, vz, 0.0, 0.0, yaw_rate,
-                _diagonal(position, position, position, level, level, odometry.yaw_variance),
+                _diagonal(position, position, height, level, level, yaw),
                 _diagonal(velocity, velocity, velocity, level, level, level),
                 odometry.reset_counter % 256,
                 mavlink.MAV_ESTIMATOR_TYPE_LIDAR,
@@ -125,7 +130,7 @@ class MavlinkAutopilot:
         """Send a body-frame velocity setpoint; one that is not finite is counted and kept back."""
         vx, vy, vz = ned.swap_flu_frd(setpoint.vx, setpoint.vy, setpoint.vz)
         _, _, yaw_rate = ned.swap_flu_frd(0.0, 0.0, setpoint.yaw_rate)
-        if not all(map(math.isfinite, (vx, vy, vz, yaw_rate))):
+        if not all(map(math.isfinite, (stamp, vx, vy, vz, yaw_rate))):
             self.dropped["unsent"] += 1
             return
         self._send(
@@ -176,11 +181,13 @@ class MavlinkAutopilot:
     def _send(self, message: Any) -> None:
         if self._peer is None:
             return  # not yet heard: there is nowhere to send to
-        packed = message.pack(self._codec)
-        self._codec.seq = (self._codec.seq + 1) % 256
         try:
+            packed = message.pack(self._codec)
+            self._codec.seq = (self._codec.seq + 1) % 256
             self._socket.sendto(packed, self._peer)
-        except (BlockingIOError, ConnectionRefusedError):
+        except (OSError, struct.error, OverflowError) as error:  # a network that comes and goes must not end the runner
+            if self.dropped["unsent"] == 0:
+                _log.warning("not sent: %s (further ones are counted, not logged)", error)
             self.dropped["unsent"] += 1
 
     def _drain(self) -> None:
@@ -189,13 +196,17 @@ class MavlinkAutopilot:
                 datagram, sender = self._socket.recvfrom(_READ_BYTES)
             except BlockingIOError:
                 return
-            except ConnectionRefusedError:  # the vehicle's port is closed, for now
+            except OSError:  # the vehicle's port is closed, or its network away, for now
                 continue
+            now = time.monotonic()
             for message in self._messages(datagram):
                 if message.get_srcSystem() != self.system or message.get_srcComponent() != AUTOPILOT:
                     self.dropped["foreign"] += 1
                     continue
-                self._peer = sender
+                if sender != self._peer and now - self._peer_at < _PEER_SILENT_S:
+                    self.dropped["foreign"] += 1
+                    continue
+                self._peer, self._peer_at = sender, now
                 self._assembler.feed(message)
 
     def _messages(self, datagram: bytes) -> Iterator[Any]:

@@ -146,6 +146,8 @@ def _open_session(data: bytes, path: Path) -> Any:
     import onnxruntime as ort  # here, not above: 0.15 s that replay and tools without a policy need not pay
     from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
 
+    ort.disable_telemetry_events()  # a drone reports to its pilot alone
+
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL

@@ -17,13 +17,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 
-from imagine.core.errors import WorkError
+from imagine.core.errors import InputError, WorkError
 from imagine.core.lidar import Scan
-from imagine.mesh_comm.links import MeshLink, UdpModemLink, open_link
+from imagine.mesh_comm.links import MeshLink, UdpBroadcastLink, UdpModemLink, open_link
 from imagine.onboard.autopilot import Autopilot
 from imagine.onboard.build import build_runner, load_policy, mesh_sealer, warm_up
-from imagine.onboard.flight import FINAL, Phase
 from imagine.onboard.lidar_source import LidarSource
+from imagine.onboard.phases import FINAL, Phase
 from imagine.onboard.records import TickInput, TickOutput
 from imagine.onboard.report import FlightRecord, write_map, write_report
 from imagine.onboard.runner import Runner
@@ -87,12 +87,22 @@ def run_drone(settings: DroneSettings) -> int:
             stack.callback(link.close)
         ending = stack.enter_context(_end_signals())
         loop = Loop(settings, runner, lidar, autopilot, link, clock)
+        unwritten: InputError | WorkError | None = None
         try:
             loop.run(ending)
         finally:
-            loop.record.dropped.update(autopilot.dropped)
-            loop.leave_behind(settings.report, settings.map_out)
+            dropped = loop.record.dropped
+            dropped.update(autopilot.dropped)
+            dropped.update(lidar.dropped)
+            dropped["mesh_lost"] += link.lost if isinstance(link, (UdpModemLink, UdpBroadcastLink)) else 0
+            try:
+                loop.leave_behind(settings.report, settings.map_out)
+            except (InputError, WorkError) as error:  # what befell the flight itself is told first
+                _log.error("drone %d: %s", settings.drone_id, error)
+                unwritten = error
     _raise_failure(runner, loop.gave_up)
+    if unwritten is not None:
+        raise unwritten
     return 0
 
 

@@ -47,13 +47,16 @@ class Telemetry:
     """The newest of everything the autopilot says, heights in metres above where it was armed.
 
     `battery` is in 0..1, None where unknown. `position_ok`: its estimator has a local position. `texts` and `acks` are
-    those that came since the telemetry before.
+    those that came since the telemetry before. `ranged`: the height is a rangefinder's, not the autopilot's own
+    estimate; `height_age_s` grows from 0 once a rangefinder falls silent that had been heard.
     """
 
     stamp: float
     yaw: float = 0.0
     yaw_rate: float = 0.0
     height_m: float = 0.0
+    ranged: bool = False
+    height_age_s: float = 0.0
     climb_mps: float = 0.0
     battery: float | None = None
     armed: bool = False
@@ -87,6 +90,7 @@ class OdometryOut:
     velocity: tuple[float, float, float]
     yaw_rate: float
     position_variance: float
+    height_variance: float
     yaw_variance: float
     velocity_variance: float
     reset_counter: int

@@ -1,4 +1,7 @@
-"""A LiDAR recording through the onboard code: the same perception and evidence map that fly."""
+"""A LiDAR recording through the runner that flies: every scan is one `Runner.tick`, with the drone on the ground.
+
+The autopilot's part is played by the recording: its yaw prior stands for the gyro's yaw, and nobody arms the vehicle.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +19,19 @@ from pydantic import Field
 
 from imagine.core.config import Settings
 from imagine.core.errors import InputError, WorkError
-from imagine.core.evidence import EvidenceMap
+from imagine.core.evidence import MAX_TILES, EvidenceMap
 from imagine.core.frames import Pose
 from imagine.core.lidar import Scan, returns
+from imagine.core.mapping import MapSettings
+from imagine.core.raster import CELL, TILE
 from imagine.onboard.alignment import ate_rmse
 from imagine.onboard.estimator import EstimatorSettings
 from imagine.onboard.map_image import draw_map
 from imagine.onboard.perception import Perception, PerceptionResult, PerceptionSettings
 from imagine.onboard.recordings import Recording, open_recording
+from imagine.onboard.records import Telemetry, TickInput
+from imagine.onboard.runner import Runner
+from imagine.onboard.settings import DroneSettings
 
 logger = logging.getLogger(__name__)
 
@@ -82,26 +90,32 @@ class ReplayResult:
 def replay(
     recording: Recording, settings: ReplaySettings | None = None, on_progress: Progress | None = None
 ) -> ReplayResult:
-    """Run every scan of a recording through perception and into an evidence map.
+    """Tick a runner with every scan of a recording.
 
     Raises WorkError where the scans are too sparse to track, or track is lost: a map drawn on would be wrong.
     """
     settings = settings or ReplaySettings()
     _refuse_sparse(recording, settings.min_returns)
-    perception = Perception(recording.spec, settings.perception)
-    evidence = EvidenceMap(own=1)
+    perception = _Overheard(recording.spec, settings.perception)
+    drone = DroneSettings(policy=None, map=MapSettings(range_cap_m=settings.range_cap_m))
+    evidence = EvidenceMap(drone.drone_id, max_extent_m=MAX_TILES * TILE * CELL)  # a recording's corridors may be long
+    runner = Runner(drone, None, perception, evidence, None)
+    runner.lidar = recording.spec  # the recording's own sensor in place of the drone's
     poses: list[Pose] = []
     scan_ms: list[float] = []
     tracked = 0
     for number, record in enumerate(recording.records, start=1):
+        scan = record.scan if settings.clear_without_return else _returns_only(record.scan)
+        yaw = record.yaw_prior
+        telemetry = None if yaw is None else Telemetry(scan.stamp, yaw=yaw)
         started = time.perf_counter()
-        result = perception.update(record.scan, record.yaw_prior)
-        if result.ok:
-            scan = record.scan if settings.clear_without_return else _returns_only(record.scan)
-            evidence.integrate(result.pose, scan, recording.spec, settings.range_cap_m)
-            tracked += 1
+        output = runner.tick(TickInput(scan.stamp, scan, telemetry))
         scan_ms.append((time.perf_counter() - started) * 1e3)
-        poses.append(result.pose)
+        poses.append(output.status.pose)
+        tracked += output.status.tracked
+        result = perception.last
+        if result is None:
+            raise WorkError(f"{recording.path}: scan {number} is not newer than the one before it")
         if not result.ok:
             logger.warning("scan %d not tracked: %s", number, result.reason)
         if result.lost:
@@ -115,8 +129,19 @@ def replay(
         trajectory=tuple(poses),
         scan_ms=tuple(scan_ms),
         ate_rmse_m=_ate(recording, poses),
-        evidence=evidence,
+        evidence=runner.evidence,
     )
+
+
+class _Overheard(Perception):
+    """Perception that keeps its latest result, for the messages of a replay that loses track."""
+
+    last: PerceptionResult | None = None
+
+    def update(self, scan: Scan, yaw_prior: float | None = None) -> PerceptionResult:
+        """Perceive, and remember what came of it."""
+        self.last = super().update(scan, yaw_prior)
+        return self.last
 
 
 def replay_file(

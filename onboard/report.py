@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from imagine.core.errors import InputError
+from imagine.core.errors import InputError, WorkError
 from imagine.core.evidence import EvidenceMap
 from imagine.mesh_comm.node import MeshNode
-from imagine.onboard.flight import Phase
 from imagine.onboard.ladder import Decider
+from imagine.onboard.phases import Phase
 from imagine.onboard.records import Event, TickOutput
 
 _TRACK_STEP_M = 0.02  # shorter moves are estimate noise, not distance flown
@@ -93,13 +93,18 @@ _KINDS = ("scan", "tile", "digest", "status")
 
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
-    """Write a report in one piece: a reader sees the whole of it or nothing. Raises InputError if it cannot."""
+    """Write a report in one piece: a reader sees the whole of it or nothing.
+
+    Raises InputError if it cannot, WorkError for a report that holds a number that is not finite.
+    """
     fresh = path.with_name(f"{path.name}.{os.getpid()}.new")
     try:
         fresh.write_text(json.dumps(report, allow_nan=False), encoding="utf-8")
         fresh.replace(path)
     except OSError as error:
         raise InputError(f"{path}: the report cannot be written: {error.strerror}") from error
+    except ValueError as error:
+        raise WorkError(f"{path}: the report cannot be written: {error}") from error
 
 
 def write_map(path: Path, evidence: EvidenceMap) -> None:

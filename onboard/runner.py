@@ -23,9 +23,10 @@ from imagine.core.planner import plan_velocity
 from imagine.core.shield import shield_velocity
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.node import MeshNode
-from imagine.onboard.flight import AIRBORNE, Flight, FlightStep, Phase
+from imagine.onboard.flight import Flight, FlightStep
 from imagine.onboard.ladder import STILL, Decider, Decision, Ladder, Order, Situation, Velocity
 from imagine.onboard.perception import Perception, PerceptionResult
+from imagine.onboard.phases import AIRBORNE, Phase
 from imagine.onboard.policy import Policy
 from imagine.onboard.records import Event, OdometryOut, RunnerStatus, Setpoint, Telemetry, TickInput, TickOutput
 from imagine.onboard.settings import DroneSettings
@@ -52,6 +53,8 @@ class Proposals:
 
 
 _NOTHING = Proposals(None, "", None, math.inf)
+_OWN_HEIGHT_VARIANCE_M2 = 100.0
+"""Of a height that is not a rangefinder's: the autopilot must not take its own estimate for a measurement."""
 _ON_GROUND = Decision(Decider.HOLD, STILL, "on the ground")
 
 
@@ -121,7 +124,8 @@ class Runner:
         for datagram in inputs.datagrams:
             self.mesh.receive(datagram, inputs.now)
         for command in self.mesh.commands():
-            self._order = Order(command.action)
+            if self._order is not Order.LAND:  # a landing stands
+                self._order = Order(command.action)
             self._tell(inputs.now, "command", f"the pilot ordered {command.action}")
 
     def _map(self, where: PerceptionResult | None, inputs: TickInput) -> Mapped | None:
@@ -170,7 +174,9 @@ class Runner:
             action = self.policy.infer(observation)
         except WorkError as error:
             return None, str(error)
-        if action.shape != (contract.action.size,) or not np.isfinite(action).all():
+        if action.shape != (contract.action.size,):
+            return None, f"the policy's output has shape {action.shape}, expected ({contract.action.size},)"
+        if not np.isfinite(action).all():
             return None, "the policy's output is not finite"
         return to_body_velocity(action, contract.action, contract.observation.axes, pose.yaw), ""
 
@@ -201,6 +207,7 @@ class Runner:
                 ending=inputs.ending,
                 exploring=self._was_exploring,
                 has_scan=not unseen,
+                height_age_s=telemetry.height_age_s if telemetry is not None else 0.0,
             )
         )
         if decision.decider is not self._decider:
@@ -263,6 +270,7 @@ class Runner:
             velocity=(vx, vy, telemetry.climb_mps),
             yaw_rate=where.yaw_rate,
             position_variance=max(variance[0], variance[1]),
+            height_variance=max(variance[0], variance[1]) if telemetry.ranged else _OWN_HEIGHT_VARIANCE_M2,
             yaw_variance=variance[2],
             velocity_variance=max(variance[3], variance[4]),
             reset_counter=self._reset_counter,

@@ -73,7 +73,7 @@ class DroneSettings(Settings):
     mesh: str | None = None
     key_file: Path | None = Field(default=None, description="the swarm's key; None: environment IMAGINE_MESH_KEY")
     boot_file: Path | None = Field(
-        default=None, description="remembers the boot number that keeps the mesh's seal safe; None: the clock alone"
+        default=None, description="remembers the mesh's boot number between starts; None: ~/.imagine/drone-ID.boot"
     )
     radio: MeshSettings = MeshSettings()
     policy: Path | None = Field(default=DEFAULT_POLICY, description="ONNX file; None: the frontier planner flies")

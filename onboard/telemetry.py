@@ -13,6 +13,8 @@ from imagine.onboard.records import Ack, FlightMode, Telemetry, VehicleCommand
 
 _FRESH_S = 1.0
 _RANGEFINDER_FRESH_S = 0.5
+_HEARTBEAT_FRESH_S = 2.5  # it comes once a second, and carries mode and armed
+_SIGNAL_INVALID = 1  # DISTANCE_SENSOR.signal_quality; 0 is unknown
 _TEXT_BYTES = 50
 _MOST_TEXTS = 20
 
@@ -49,11 +51,13 @@ class TelemetryAssembler:
         """Time of the newest ATTITUDE, seconds since the vehicle booted."""
         self._clock = clock
         self._stamp = -math.inf
-        self._heard_heartbeat = False
+        self._heard_heartbeat = self._beat_is_new = False
+        self._beat_at = -math.inf
         self._yaw = self._yaw_rate = 0.0
         self._height = self._ground = self._climb = 0.0
         self._position_at = -math.inf
         self._range_m, self._range_at = 0.0, -math.inf
+        self._has_range = False
         self._battery: float | None = None
         self._armed = False
         self._mode = FlightMode.OTHER
@@ -87,18 +91,22 @@ class TelemetryAssembler:
     def take(self) -> Telemetry | None:
         """Return the newest telemetry, with the texts and acks since the last taking; None while too little is known.
 
-        Height comes from the downward rangefinder while it is heard, else from the local position since arming.
+        Height comes from the downward rangefinder once one is heard, else from the local position since arming. When
+        a rangefinder falls silent in flight its last height stands, and ages: the local position has another zero.
+        With the heartbeat silent the stamp stops too, for mode and armed are no longer known.
         """
         if not self._heard_heartbeat or math.isinf(self.attitude_time):
             return None
         texts, acks = tuple(self._texts), tuple(self._acks)
         self._texts, self._acks = [], []
-        ranged = self.attitude_time - self._range_at <= _RANGEFINDER_FRESH_S
+        age = max(0.0, self.attitude_time - self._range_at) if self._has_range else 0.0
         return Telemetry(
-            stamp=self._stamp,
+            stamp=min(self._stamp, self._beat_at + _HEARTBEAT_FRESH_S),
             yaw=self._yaw,
             yaw_rate=self._yaw_rate,
-            height_m=self._range_m if ranged else self._height - self._ground,
+            height_m=self._range_m if self._has_range else self._height - self._ground,
+            ranged=self._has_range and age <= _RANGEFINDER_FRESH_S,
+            height_age_s=age,
             climb_mps=self._climb,
             battery=self._battery,
             armed=self._armed,
@@ -113,16 +121,20 @@ class TelemetryAssembler:
         armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         if not armed or not self._armed:
             self._ground = self._height
+        if not armed and self.attitude_time - self._range_at > _RANGEFINDER_FRESH_S:
+            self._has_range = False  # on the ground a rangefinder may be nearer than it can see
         self._armed = armed
         reader = MODE_READERS.get(message.autopilot)
         self._mode = reader(message.custom_mode) if reader is not None else FlightMode.OTHER
-        self._heard_heartbeat = True
+        self._heard_heartbeat = self._beat_is_new = True
 
     def _on_attitude(self, message: Any) -> None:
         if not (math.isfinite(message.yaw) and math.isfinite(message.yawspeed)):
             return
         self.attitude_time = message.time_boot_ms / 1000.0
         self._stamp = self.attitude_time if self._clock is None else self._clock()
+        if self._beat_is_new:
+            self._beat_at, self._beat_is_new = self._stamp, False
         self._yaw = ned.swap_yaw(message.yaw)
         self._yaw_rate = ned.swap_flu_frd(0.0, 0.0, message.yawspeed)[2]
 
@@ -136,9 +148,12 @@ class TelemetryAssembler:
             self._ground = self._height
 
     def _on_range(self, message: Any) -> None:
-        if message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270:  # looking down
+        looks_down = message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270
+        is_in_range = message.min_distance <= message.current_distance <= message.max_distance
+        if looks_down and is_in_range and message.signal_quality != _SIGNAL_INVALID:
             self._range_m = message.current_distance / 100.0
             self._range_at = message.time_boot_ms / 1000.0
+            self._has_range = True
 
     def _on_battery(self, message: Any) -> None:
         if message.battery_remaining >= 0:

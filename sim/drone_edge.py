@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from imagine.core.lidar import LidarSpec, Scan
 from imagine.core.lidar_wire import encode_scan
-from imagine.sim.modem import Modem, decode_marker, encode_marker
+from imagine.mesh_comm.markers import decode_marker, encode_marker
+from imagine.sim.modem import Modem
 from imagine.sim.sockets import Address, bind_udp, free_listen_port
 from imagine.sim.vehicle import Vehicle
 from imagine.sim.vehicle_link import VehicleLink

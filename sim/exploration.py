@@ -9,63 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
 
-from imagine.core.config import Settings
-from imagine.core.contract import ActionSpec
 from imagine.core.errors import InputError
 from imagine.core.lidar import PRESETS
-from imagine.core.mapping import MapSettings
-from imagine.core.observation import fill_motion, fill_sectors, fill_views
-from imagine.core.observation_spec import ObservationSpec
 from imagine.core.planner import plan_kernel
-from imagine.core.raster import CELL
-from imagine.core.shield import shield_kernel
-from imagine.core.vehicle_limits import VehicleLimits
+from imagine.sim.exploration_kernels import fill_critic, fill_observations, shielded_setpoints
+from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.level import Level, load_level, mirrored
 from imagine.sim.team_maps import TeamMaps
 from imagine.sim.twin import TICK_S, Twin
 
 CRITIC_CHANNELS, CRITIC_CELLS = 5, 32
 _IDLE_TICKS = 30  # an episode ends when nobody has had a frontier for so long
-
-
-class ExplorationSettings(Settings):
-    """What is explored, by whom, and what a policy sees and does."""
-
-    levels: tuple[str, ...] = Field(default=("0", "1", "2", "3", "4", "5", "6"), min_length=1)
-    level_weights: tuple[float, ...] | None = Field(default=None, description="share of episodes per level")
-    worlds: int = Field(default=24, ge=1, le=4096)
-    drones: int = Field(default=3, ge=1, le=16)
-    episode_ticks: int = Field(default=1000, ge=1)
-    stop_coverage: float = Field(default=0.995, gt=0.0, le=1.0, description="an episode ends when so much is covered")
-    random_launch: bool = Field(default=True, description="start anywhere, not at the level's launch point")
-    mirror: bool = Field(default=True, description="show levels mirrored and turned as well")
-    stagger: bool = Field(default=False, description="give first episodes different lengths, so resets spread out")
-    lidar: str = "ld19"
-    map: MapSettings = MapSettings()
-    limits: VehicleLimits = VehicleLimits()
-    observation: ObservationSpec = ObservationSpec()
-    action: ActionSpec = ActionSpec()
-    protocol: Literal["off", "one-hop", "multi-hop"] = "one-hop"
-    radio_range_m: float = Field(default=5.0, gt=0.0)
-    tiles_a_tick: int = Field(
-        default=20, ge=1, description="what 250 kbit/s carries in 0.1 s at about 150 bytes a tile"
-    )
-    reward_scale: float = Field(default=5.0, gt=0.0)
-    own_credit: float = Field(default=0.5, ge=0.0, le=1.0, description="share of the reward for own discoveries")
-
-    @field_validator("lidar")
-    @classmethod
-    def _known_lidar(cls, name: str) -> str:
-        if name not in PRESETS:
-            raise ValueError(f"unknown LiDAR; known: {', '.join(PRESETS)}")
-        return name
 
 
 @dataclass(frozen=True)
@@ -185,7 +144,7 @@ class Exploration:
     def _setpoints(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
         setpoints = np.zeros((self.worlds, self.drones, 3))
         spec, limits, lidar = self.settings.action, self.settings.limits, self.lidar
-        _shielded_setpoints(
+        shielded_setpoints(
             setpoints, actions.astype(np.float64), spec.mode == "body", self.settings.observation.axes == "map",
             spec.speed_mps, spec.yaw_rate_rps, self.twin.poses, self._ranges,
             (lidar.range_min, lidar.start, lidar.increment),
@@ -271,14 +230,14 @@ class Exploration:
         critic = np.zeros((*batch, CRITIC_CHANNELS, CRITIC_CELLS, CRITIC_CELLS), np.float32)
         workers = self.twin.workers
         workers.over(
-            self.worlds, _fill_observations, policy["views"], policy["lidar"], policy["motion"],
+            self.worlds, fill_observations, policy["views"], policy["lidar"], policy["motion"],
             self.maps.belief, self.maps.distance, self.maps.origins, self.twin.poses, self.twin.velocity, self._ranges,
             (lidar.range_min, lidar.start, lidar.increment), np.array(spec.view_scales_m),
             np.array(spec.frontier_ranges_m), spec.lidar_range_m, spec.speed_mps, spec.yaw_rate_rps,
             spec.axes == "heading",
         )  # fmt: skip
         workers.over(
-            self.worlds, _fill_critic, critic, self.maps.seen, self.maps.coverable, self.maps.origins, self.twin.poses
+            self.worlds, fill_critic, critic, self.maps.seen, self.maps.coverable, self.maps.origins, self.twin.poses
         )
         return Observation(policy, critic)
 
@@ -330,75 +289,3 @@ def _weights(settings: ExplorationSettings) -> NDArray[np.float64]:
 def _first_at_least(curve: NDArray[np.float32], share: float) -> int | None:
     reached = np.flatnonzero(curve >= share)
     return int(reached[0]) + 1 if len(reached) else None
-
-
-@numba.njit(cache=True, nogil=True)
-def _shielded_setpoints(  # type: ignore[no-untyped-def]
-    setpoints, actions, body_mode, map_axes, speed, fastest_yaw, poses, ranges, lidar, limits
-):
-    """Turn actions into body velocities as `core.action` does, and pass them through the shield as in flight."""
-    range_min, start, increment = lidar
-    radius, lag, acceleration = limits
-    for world in range(actions.shape[0]):
-        for drone in range(actions.shape[1]):
-            ax = min(max(actions[world, drone, 0], -1.0), 1.0)
-            ay = min(max(actions[world, drone, 1], -1.0), 1.0)
-            rate = 0.0
-            if body_mode:
-                vx, vy = ax * speed, ay * speed
-                rate = min(max(actions[world, drone, 2], -1.0), 1.0) * fastest_yaw
-            else:
-                length = max(1.0, math.sqrt(ax * ax + ay * ay))
-                vx, vy = ax / length * speed, ay / length * speed
-                if map_axes:
-                    c, s = math.cos(poses[world, drone, 2]), math.sin(poses[world, drone, 2])
-                    vx, vy = c * vx + s * vy, -s * vx + c * vy
-            vx, vy = shield_kernel(vx, vy, ranges[world, drone], range_min, start, increment, radius, lag, acceleration)
-            setpoints[world, drone, 0], setpoints[world, drone, 1], setpoints[world, drone, 2] = vx, vy, rate
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill_observations(  # type: ignore[no-untyped-def]
-    first, last, views, sectors, motion, belief, distance, origins, poses, velocity, ranges, lidar, scales,
-    frontier_ranges, lidar_range, speed, fastest_yaw, heading_axes,
-):  # fmt: skip
-    range_min, start, increment = lidar
-    drones = views.shape[1]
-    for index in range(first * drones, last * drones):
-        world, drone = index // drones, index % drones
-        x, y, yaw = poses[world, drone]
-        turn = yaw if heading_axes else 0.0
-        fill_views(
-            views[world, drone], belief[world, drone], distance[world, drone], origins[world, 0], origins[world, 1],
-            x, y, turn, scales, frontier_ranges,
-        )  # fmt: skip
-        fill_sectors(sectors[world, drone], ranges[world, drone], range_min, start, increment, yaw - turn, lidar_range)
-        fill_motion(
-            motion[world, drone], velocity[world, drone, 0], velocity[world, drone, 1], velocity[world, drone, 2],
-            turn, speed, fastest_yaw,
-        )  # fmt: skip
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill_critic(first, last, critic, seen, coverable, origins, poses):  # type: ignore[no-untyped-def]
-    """Fill the critic's images: share unexplored, explored and not free per 0.8 m pixel, own and other drones."""
-    _, drones, _, side, _ = critic.shape
-    rows, columns = seen.shape[1], seen.shape[2]
-    block = max(8, math.ceil(max(rows, columns) / side))
-    for world in range(first, last):
-        for row in range(rows):
-            for column in range(columns):
-                if coverable[world, row, column]:
-                    channel = 1 if seen[world, row, column] else 0
-                    critic[world, 0, channel, row // block, column // block] += 1.0 / (block * block)
-        for i in range(side):
-            for j in range(side):
-                critic[world, 0, 2, i, j] = 1.0 - critic[world, 0, 0, i, j] - critic[world, 0, 1, i, j]
-        for drone in range(1, drones):
-            critic[world, drone, :3] = critic[world, 0, :3]
-        for drone in range(drones):
-            i = (math.floor(poses[world, drone, 1] / CELL) - origins[world, 1]) // block
-            j = (math.floor(poses[world, drone, 0] / CELL) - origins[world, 0]) // block
-            if 0 <= i < side and 0 <= j < side:
-                for viewer in range(drones):
-                    critic[world, viewer, 3 if viewer == drone else 4, i, j] = 1.0

@@ -67,6 +67,13 @@ class LevelFile(Settings):
     boxes: list[Box] = Field(default_factory=list)
     circles: list[Circle] = Field(default_factory=list)
 
+    @field_validator("size_m")
+    @classmethod
+    def _of_a_building(cls, size: Point | None) -> Point | None:
+        if size is not None and not all(0.5 <= side <= _LARGEST_M for side in size):
+            raise ValueError(f"each side must lie within 0.5 and {_LARGEST_M:g} m")
+        return size
+
     @field_validator("walls")
     @classmethod
     def _two_points(cls, walls: list[list[Point]]) -> list[list[Point]]:
@@ -79,8 +86,6 @@ class LevelFile(Settings):
     def _one_outline(self) -> LevelFile:
         if self.extends is None and (self.size_m is None) == (self.outline is None):
             raise ValueError("give either size_m or outline")
-        if self.size_m is not None and not all(0.5 <= side <= _LARGEST_M for side in self.size_m):
-            raise ValueError(f"size_m must lie within 0.5 and {_LARGEST_M:g} m")
         return self
 
 

@@ -1,33 +1,17 @@
 """A drone's radio modem as a UDP socket: what a runner sends there goes on air, what it receives comes from the air.
 
-In lockstep both sides also send markers on this link, `IMTK` and the tick's stamp as a little-endian f64; they say
-that all mesh traffic of the tick has been sent. Neither they nor greetings ever go on air.
+In lockstep both sides also send markers on this link (`mesh_comm.markers`). Neither they nor greetings go on air.
 """
 
 from __future__ import annotations
 
 import logging
-import struct
 from collections.abc import Iterable
 
-from imagine.mesh_comm.links import HELLO, MARKER_MAGIC
+from imagine.mesh_comm.links import HELLO
 from imagine.sim.sockets import Address, bind_udp, drain
 
 logger = logging.getLogger(__name__)
-
-_MARKER = struct.Struct("<4sd")
-
-
-def encode_marker(stamp: float) -> bytes:
-    """Return the marker that ends a tick's mesh traffic; `stamp` in seconds."""
-    return _MARKER.pack(MARKER_MAGIC, stamp)
-
-
-def decode_marker(datagram: bytes) -> float | None:
-    """Return the stamp of a marker; None when the datagram is a mesh message."""
-    if len(datagram) != _MARKER.size or not datagram.startswith(MARKER_MAGIC):
-        return None
-    return float(_MARKER.unpack(datagram)[1])
 
 
 class Modem:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
-from imagine.sim.exploration import CRITIC_CELLS, CRITIC_CHANNELS, Exploration, ExplorationSettings, Observation
+from imagine.sim.exploration import CRITIC_CELLS, CRITIC_CHANNELS, Exploration, Observation
+from imagine.sim.exploration_settings import ExplorationSettings
 
 try:
     from gymnasium import spaces

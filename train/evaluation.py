@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
-from imagine.sim.exploration import EpisodeMetrics, Exploration, ExplorationSettings
+from imagine.mesh_comm.settings import Protocol
+from imagine.sim.exploration import EpisodeMetrics, Exploration
+from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.policies import Policy, load_policy
-
-Protocol = Literal["off", "one-hop", "multi-hop"]
 
 MAX_WORLDS = 16
 BYTES_PER_TILE = 150

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from imagine.onboard.policy import OnnxPolicy
-from imagine.sim.exploration import ExplorationSettings
+from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.checkpoint import actor_of, load_checkpoint
 from imagine.train.networks import Actor
 from imagine.train.rollout import OBSERVATION_KEYS

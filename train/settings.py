@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field
 
 from imagine.core.config import Settings, load_settings
-from imagine.sim.exploration import ExplorationSettings
+from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.imitation import ImitationSettings
 from imagine.train.networks import NetworkSettings
 from imagine.train.ppo import PpoSettings

@@ -34,7 +34,6 @@ function onState(next, first) {
 function onChange(next) {
   if (next === phase) return;
   phase = next;
-  document.body.dataset.connection = next;
   refresh();
 }
 
@@ -46,18 +45,20 @@ function onAnswer(answer) {
 
 function refresh() {
   const offline = phase !== "live";
-  const stalled = !offline && state && state.published_age_s > STALLED_S;
+  const over = state?.over ?? ""; // the flight has ended: what is shown is final, whether the server still runs or not
+  const stalled = !offline && !over && state && state.published_age_s > STALLED_S;
   const quiet = offline ? link.quietSeconds : 0;
   for (const button of document.querySelectorAll(".commands button")) button.disabled = offline || !state?.drones.length;
-  byId("connection").dataset.state = offline ? phase : stalled ? "stalled" : "live";
-  setText("connection-text", { connecting: "Connecting", live: stalled ? "Stalled" : "Connected", lost: "Disconnected" }[phase]);
-  banner(phase === "lost"
+  document.body.dataset.connection = over ? "over" : phase;
+  byId("connection").dataset.state = over ? "over" : offline ? phase : stalled ? "stalled" : "live";
+  setText("connection-text", over ? "Flight over" : { connecting: "Connecting", live: stalled ? "Stalled" : "Connected", lost: "Disconnected" }[phase]);
+  banner(over ? over : phase === "lost"
     ? `Connection to the ground station lost${state ? `. What you see is ${Math.round(quiet)} s old` : ""}. Trying again.`
     : stalled ? `The ground station answers, but its flight loop has given nothing new for ${Math.round(state.published_age_s)} s.` : "");
   byId("empty").hidden = Boolean(state?.drones.length);
   if (!state) return;
-  const extra = quiet + (stalled ? state.published_age_s : 0);
-  const why = offline ? "No connection to the ground station: these are the last figures."
+  const extra = over ? 0 : quiet + (stalled ? state.published_age_s : 0);
+  const why = over ? "" : offline ? "No connection to the ground station: these are the last figures."
     : stalled ? "The ground station's flight loop is silent: these are the last figures." : "";
   panel.update(state, why, extra, map.follow);
   showFigures(offline);
@@ -90,7 +91,10 @@ function showCommand() {
   const whom = c.target ? `Drone ${c.target}` : "All drones";
   const missing = c.expected.filter((id) => !c.confirmed.includes(id));
   if (missing.length) notice(`${whom} told to ${DOING[c.action]}: ${c.confirmed.length} of ${c.expected.length} confirmed, waiting for ${missing.map((i) => `D${i}`).join(", ")}`, "waiting");
-  else notice(`${whom} told to ${DOING[c.action]}: confirmed by all`, "done");
+  else {
+    const gone = state.drones.filter((d) => d.lost && (!c.target || d.id === c.target)).map((d) => `D${d.id}`).join(", ");
+    notice(`${whom} told to ${DOING[c.action]}: confirmed by all${gone ? ` that are heard; ${gone} lost` : ""}`, gone ? "waiting" : "done");
+  }
 }
 
 function setText(id, text) { const node = byId(id); if (node.textContent !== text) node.textContent = text; }

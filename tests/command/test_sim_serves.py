@@ -25,7 +25,8 @@ def test_a_runner_elsewhere_flies_by_the_printed_command(tmp_path: Path) -> None
     ) as sim:
         command = sim.line_with("drone 1: imagine fly ").partition("imagine ")[2]
         assert f"udpin://127.0.0.1:{base + 1} " in command
-        with Running(*shlex.split(command), *POLICY, "--json", report, env=keyed) as drone:
+        boot = f"boot_file={tmp_path / 'drone.boot'}"  # not in the home folder of whoever tests
+        with Running(*shlex.split(command), *POLICY, "--set", boot, "--json", report, env=keyed) as drone:
             assert sim.end() == 0, sim.errors
             drone.process.send_signal(signal.SIGINT)
             assert drone.end() == 0, drone.errors

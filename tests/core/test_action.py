@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imagine.core.action import to_body_velocity
+from imagine.core.action import body_velocity_kernel, to_body_velocity
 from imagine.core.contract import ActionSpec
 from imagine.core.frames import rotate
 
@@ -44,6 +44,15 @@ def test_body_actions_are_scaled_and_clipped_whatever_the_heading(a: float, b: f
     expected = np.clip([a, b, c], -1.0, 1.0) * [0.6, 0.6, 2.0]
     for axes in ("map", "heading"):
         assert to_body_velocity(act(a, b, c), BODY, axes, yaw) == pytest.approx(tuple(expected), abs=1e-6)
+
+
+@given(NUMBERS, NUMBERS, NUMBERS, YAWS)
+def test_what_is_compiled_for_training_commands_what_flies(a: float, b: float, c: float, yaw: float) -> None:
+    for spec, axes in ((PLANE, "map"), (PLANE, "heading"), (BODY, "map")):
+        trained = body_velocity_kernel(
+            a, b, c, spec.mode == "body", axes == "map", spec.speed_mps, spec.yaw_rate_rps, yaw
+        )
+        assert trained == pytest.approx(to_body_velocity(act(a, b, c)[: spec.size], spec, axes, yaw), abs=1e-12)
 
 
 def test_sizes() -> None:

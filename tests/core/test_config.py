@@ -138,3 +138,8 @@ def test_whatever_the_text_it_is_read_or_refused(text: str) -> None:
         return
     assert isinstance(data, dict)
     assert all(line >= 1 for line in lines.values())
+
+
+def test_a_key_given_twice_is_refused_with_both_lines() -> None:
+    with pytest.raises(InputError, match=r"^room\.yaml:3: key 'a\.b' stands in line 2 already$"):
+        parse_yaml("a:\n  b: 1\n  b: 2\n", "room.yaml")

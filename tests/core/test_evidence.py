@@ -242,6 +242,22 @@ def test_tiles_that_cannot_be_are_refused_and_leave_no_trace(parcel: Parcel, sai
     assert evidence.versions(2) == {}
 
 
+def test_a_map_grows_to_its_largest_extent_and_no_further() -> None:
+    small, large = EvidenceMap(1), EvidenceMap(1, max_extent_m=512.0)
+    for evidence, most_m in ((small, 128.0), (large, 512.0)):
+        evidence.cover(-12.8, -12.8, most_m - 12.8 - 0.1, 0.0)
+        assert evidence.shape == (256, round(most_m / CELL))
+        with pytest.raises(InputError, match="far outside"):
+            evidence.cover(0.0, 0.0, most_m, 0.0)
+        scan = Scan(0.0, np.full(90, 1.0, np.float32))
+        with pytest.raises(InputError, match="far outside"):
+            evidence.integrate_provisional(2, Pose(-250.0, 0.0, 0.0), scan, LIDAR, CAP_M)
+        assert evidence.shape == (256, round(most_m / CELL))
+    for half_m, most_m in ((12.8, 25.0), (12.8, 600.0)):
+        with pytest.raises(InputError, match="reserved"):
+            EvidenceMap(1, half_m, most_m)
+
+
 @pytest.mark.parametrize("pose", [Pose(math.nan, 0, 0), Pose(0, math.inf, 0), Pose(0, 0, math.nan), Pose(1e300, 0, 0)])
 def test_poses_that_cannot_be_are_refused(pose: Pose) -> None:
     evidence = EvidenceMap(1)

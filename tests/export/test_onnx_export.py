@@ -12,7 +12,7 @@ from imagine.core.errors import InputError, WorkError
 from imagine.export import onnx_export
 from imagine.export.onnx_export import export_onnx, inspect, parity
 from imagine.onboard.policy import OnnxPolicy
-from imagine.sim.exploration import ExplorationSettings
+from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.checkpoint import Checkpoint, actor_of, load_checkpoint, save_checkpoint
 from imagine.train.evaluation import evaluate
 from imagine.train.networks import Actor, Critic, NetworkSettings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import struct
 import time
 from collections.abc import Callable, Iterator
 
@@ -12,23 +11,19 @@ import pytest
 from imagine.core.errors import InputError
 from imagine.mesh_comm.links import (
     HELLO,
-    MARKER_MAGIC,
     MeshLink,
     UdpBroadcastLink,
     UdpModemLink,
     VirtualAir,
     open_link,
 )
+from imagine.mesh_comm.markers import encode_marker
 
 
 def poll_until(condition: Callable[[], bool], timeout_s: float = 3.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "nothing came in time"
-
-
-def marker(stamp: float) -> bytes:
-    return MARKER_MAGIC + struct.pack("<d", stamp)
 
 
 @pytest.fixture
@@ -59,7 +54,7 @@ def test_the_modem_learns_the_address_and_carries_datagrams_both_ways(modem: soc
 
 def test_lockstep_gives_what_came_before_the_marker_and_keeps_the_rest(modem: socket.socket) -> None:
     link, address = connect(modem)
-    for datagram in (b"one", b"two", marker(0.1), b"three", marker(0.2)):
+    for datagram in (b"one", b"two", encode_marker(0.1), b"three", encode_marker(0.2)):
         modem.sendto(datagram, address)
     assert link.wait_marker(0.1, 3.0)
     assert link.receive() == [b"one", b"two"]
@@ -68,7 +63,7 @@ def test_lockstep_gives_what_came_before_the_marker_and_keeps_the_rest(modem: so
     assert link.receive() == [b"three"]
     assert not link.wait_marker(0.3, 0.01)
     link.send_marker(0.2)
-    assert modem.recv(2000) == marker(0.2)
+    assert modem.recv(2000) == encode_marker(0.2)
     link.close()
 
 
@@ -90,7 +85,7 @@ def test_a_modem_that_starts_late_is_greeted_again() -> None:
                 datagram, address = late.recvfrom(2000)
             except BlockingIOError:
                 return False
-            late.sendto(marker(0.0), address)
+            late.sendto(encode_marker(0.0), address)
             answered = datagram == HELLO
             return answered
 

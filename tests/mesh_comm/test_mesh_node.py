@@ -477,6 +477,29 @@ def test_a_tile_far_outside_is_refused_and_memory_stays_bounded() -> None:
     assert len(drone.evidence.layers) == 4  # own and max_sources
 
 
+@pytest.mark.parametrize(
+    "tiles",
+    [
+        Tiles(1, [Tile(0, 0, 1, b"no cells at all")]),
+        Tiles(2, [Tile(0, 0, 2**31, b"no cells at all")]),  # the listener's own
+        Tiles(1, [Tile(160, 0, 1, pack_tile(np.ones((32, 32), np.int8)))]),
+        Tiles(200, [Tile(0, 0, 1, pack_tile(np.ones((32, 32), np.int8)))]),  # one source too many
+    ],
+    ids=["damaged", "own damaged", "far away", "too many sources"],
+)
+def test_nothing_is_noted_of_tiles_that_are_refused(tiles: Tiles) -> None:
+    drone = listener()
+    cells = pack_tile(np.ones((32, 32), np.int8))
+    for source in (3, 4) if tiles.source == 1 else (3, 4, 5):
+        drone.node.receive(_FORGER.seal(messages.encode(Tiles(source, [Tile(0, 0, 1, cells)]))), 0.0)
+    record, noted = drone.node._peers.live(0.0)[0], len(drone.node._exchange._sent)
+    before = {source: dict(held) for source, held in record.holdings.items()}
+    drone.node.receive(_FORGER.seal(messages.encode(tiles)), 0.1)
+    assert drone.node.stats["content"] == 1
+    assert record.holdings == before
+    assert len(drone.node._exchange._sent) == noted
+
+
 def test_a_node_in_anothers_name_is_refused() -> None:
     drone = listener()
     status = messages.encode(Status(3, 0.0, Pose(0.0, 0.0, 0.0)))

@@ -140,6 +140,13 @@ def test_boot_numbers_grow_whatever_the_clock_does(tmp_path: Path) -> None:
         next_boot_number(path, 2e9)
 
 
+def test_a_boot_file_gets_its_folder_and_one_that_cannot_be_written_is_named_with_the_remedy(tmp_path: Path) -> None:
+    assert next_boot_number(tmp_path / "new" / "folder" / "boot", 0.0) == 1
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"file/boot: .*set boot_file"):
+        next_boot_number(tmp_path / "file" / "boot", 2e9)
+
+
 @given(
     st.lists(st.tuples(st.floats(-0.1, 2.0), st.integers(1, 1200)), max_size=60),
     st.floats(100, 50000),

@@ -117,6 +117,16 @@ def test_yaw_stays_wrapped_and_innovations_take_the_short_way_round() -> None:
     assert estimator.estimate.pose.yaw == pytest.approx(-math.pi + 0.035, abs=0.01)
 
 
+@pytest.mark.parametrize("variance", [-1.0, -1e-4])
+def test_a_covariance_that_is_none_is_a_refusal_in_words(variance: float) -> None:
+    estimator = Estimator()
+    estimator.predict(0.0)
+    reason = estimator.update_odometry(Pose(0.05, 0.0, 0.0), np.diag([variance, variance, variance]))
+    assert reason is not None
+    assert "cannot be told" in reason
+    assert estimator.refused_in_a_row == 1
+
+
 def test_a_stamp_that_does_not_advance_changes_nothing() -> None:
     estimator = Estimator()
     estimator.predict(1.0)

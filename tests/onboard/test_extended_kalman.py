@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
+from types import ModuleType
 
 import numpy as np
+import pytest
 
+from imagine.onboard import extended_kalman
 from imagine.onboard.extended_kalman import ExtendedKalmanFilter
 
 
@@ -24,6 +28,22 @@ def test_it_estimates_as_filterpys_own_does() -> None:
     for alone, whole in zip(*estimates, strict=True):
         assert np.array_equal(alone, whole)
     assert estimates[0][0][1, 0] > 0.5
+
+
+@pytest.mark.parametrize("error", [ImportError, AttributeError])
+def test_a_filterpy_laid_out_otherwise_is_loaded_whole(monkeypatch: pytest.MonkeyPatch, error: type[Exception]) -> None:
+    imported = importlib.import_module
+
+    def without_helpers(name: str, package: str | None = None) -> ModuleType:
+        if name == "filterpy.common.helpers":
+            raise error(name)
+        return imported(name, package)
+
+    for name in [name for name in sys.modules if name.partition(".")[0] == "filterpy"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(importlib, "import_module", without_helpers)
+    loaded = extended_kalman._load_filter()
+    assert loaded is imported("filterpy.kalman").ExtendedKalmanFilter
 
 
 def test_a_runner_starts_without_filterpys_statistics() -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import pytest
 
-from imagine.onboard.flight import Flight, Phase
+from imagine.onboard.flight import Flight
+from imagine.onboard.phases import Phase
 from imagine.onboard.records import Ack, FlightMode, Telemetry, VehicleCommand
 from imagine.onboard.settings import FlightSettings
 
@@ -140,7 +142,7 @@ def test_arming_that_is_denied_ends_in_words():
     bench = Bench(arm_deadline_s=3.0)
     bench.fly_to(Phase.ARM)
     bench.see(acks=(Ack(VehicleCommand.ARM, False, "FAILED"),))
-    failed = bench.step(40)
+    failed = bench.step(60)
     assert failed.phase is Phase.FAILED
     assert failed.reason == "the autopilot does not arm: arm was answered FAILED"
 
@@ -211,7 +213,7 @@ def test_a_pilot_who_takes_over_a_landing_keeps_the_vehicle():
     assert bench.step().phase is Phase.RELEASED
 
 
-@pytest.mark.parametrize("phase", [Phase.PREPARE, Phase.OFFBOARD, Phase.ARM])
+@pytest.mark.parametrize("phase", [Phase.PREPARE, Phase.OFFBOARD])
 def test_asked_to_land_on_the_ground_it_stays_there(phase):
     bench = Bench()
     if phase is not Phase.PREPARE:
@@ -219,6 +221,72 @@ def test_asked_to_land_on_the_ground_it_stays_there(phase):
     done = bench.step(land_reason="battery at 5%")
     assert done.phase is Phase.DONE
     assert done.reason == "battery at 5%"
+
+
+def test_an_arming_once_asked_for_is_taken_back_until_the_vehicle_has_stayed_disarmed():
+    bench = Bench(retry_s=1.0)
+    bench.fly_to(Phase.ARM)
+    bench.commands.clear()
+    order = {"land_reason": "battery at 5%"}
+    assert bench.step(10, **order).phase is Phase.DISARM
+    bench.see(armed=True)  # the autopilot obeys the arming late
+    assert bench.step(15, **order).phase is Phase.DISARM
+    bench.see(armed=False)
+    assert bench.step(10, fresh=False, **order).phase is Phase.DISARM  # what is old shows nothing
+    assert bench.step(20, **order).phase is Phase.DISARM
+    done = bench.step(**order)
+    assert (done.phase, done.reason) == (Phase.DONE, "battery at 5%")
+    assert {command for _, command in bench.commands} == {VehicleCommand.DISARM}
+    times = [at for at, _ in bench.commands]
+    assert [round(b - a, 6) for a, b in pairwise(times)] == [1.0] * (len(times) - 1)
+    assert len(times) == 6
+
+
+def test_an_arming_that_comes_after_its_deadline_is_taken_back():
+    bench = Bench(arm_deadline_s=3.0)
+    bench.fly_to(Phase.ARM)
+    assert bench.step(32).phase is Phase.DISARM
+    bench.see(armed=True)
+    late = bench.step(10)
+    assert (late.phase, late.vz, late.streams) == (Phase.DISARM, 0.0, True)
+    assert bench.commands[-1][1] is VehicleCommand.DISARM
+    bench.see(armed=False)
+    assert bench.step(25).phase is Phase.FAILED
+
+
+def test_a_vehicle_that_will_not_disarm_is_left_to_the_autopilot_in_words():
+    bench = Bench(land_deadline_s=5.0)
+    bench.fly_to(Phase.ARM)
+    bench.see(armed=True)
+    released = bench.step(60, land_reason="battery at 5%")
+    assert released.phase is Phase.RELEASED
+    assert "not seen disarmed for 5 s" in released.reason
+
+
+@pytest.mark.parametrize("phase", [Phase.OFFBOARD, Phase.ARM])
+def test_a_hold_before_takeoff_goes_back_to_the_ground(phase):
+    bench = Bench()
+    bench.fly_to(phase)
+    bench.see(mode=FlightMode.OFFBOARD)
+    held = bench.step(25, may_start=False)
+    assert (held.phase, held.reason) == (Phase.PREPARE, "held on the ground by the pilot")
+    asked = [command for _, command in bench.commands]
+    assert (VehicleCommand.DISARM in asked) == (VehicleCommand.ARM in asked) == (phase is Phase.ARM)
+    bench.step(2)
+    assert bench.commands[-1][1] is VehicleCommand.ARM
+
+
+def test_it_does_not_climb_by_old_telemetry_or_an_old_height():
+    bench = Bench()
+    bench.fly_to(Phase.CLIMB)
+    assert bench.step().vz > 0.0
+    bench.see(height_age_s=0.6)
+    assert bench.step().vz == 0.0
+    bench.see(height_age_s=0.0)
+    assert bench.step().vz > 0.0
+    bench.telemetry = dataclasses.replace(bench.telemetry, stamp=0.1 * bench.tick)
+    assert bench.step(5, fresh=False).vz > 0.0
+    assert bench.step(2, fresh=False).vz == 0.0
 
 
 def test_a_hold_keeps_it_on_the_ground_for_as_long_as_it_stands():

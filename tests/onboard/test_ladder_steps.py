@@ -62,6 +62,7 @@ def test_the_policy_decides_while_it_gets_somewhere():
         ({"lost_s": math.inf}, Decider.LAND, "lost"),
         ({"silent_s": 0.6}, Decider.HOLD, "no telemetry"),
         ({"silent_s": 3.1}, Decider.LAND, "no telemetry"),
+        ({"height_age_s": 3.1}, Decider.LAND, "no height"),
         ({"airborne_s": 301.0}, Decider.LAND, "300 s"),
         ({"frontier": None}, Decider.HOLD, "no frontier"),
         ({"exploring": False}, Decider.HOLD, "not yet exploring"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import select
 import socket
@@ -141,6 +142,79 @@ def test_height_is_counted_from_where_it_was_armed_until_a_rangefinder_is_heard(
     assert link.wait_telemetry(2.0, 1.0).height_m == pytest.approx(1.3)
 
 
+def downward(time_ms, centimetres, **quality):
+    return mavlink.MAVLink_distance_sensor_message(time_ms, 20, 800, centimetres, 0, 0, 25, 1, **quality)
+
+
+def test_what_a_rangefinder_cannot_measure_is_no_height(met):
+    link, vehicle = met
+    vehicle.send(downward(1900, 130), downward(1950, 19), downward(1950, 801), downward(1950, 50, signal_quality=1))
+    vehicle.attitude(2.0)
+    assert link.wait_telemetry(2.0, 1.0).height_m == pytest.approx(1.3)
+
+
+def test_a_rangefinder_that_falls_silent_in_flight_leaves_its_last_height_to_age(met):
+    link, vehicle = met
+    vehicle.heartbeat(PX4_OFFBOARD, armed=True)
+    vehicle.send(downward(1900, 130))
+    vehicle.attitude(2.0)
+    heard = link.wait_telemetry(2.0, 1.0)
+    assert (heard.ranged, heard.height_age_s) == (True, pytest.approx(0.1))
+    vehicle.heartbeat(PX4_OFFBOARD, armed=True)
+    vehicle.send(mavlink.MAVLink_local_position_ned_message(3900, 0.0, 0.0, -4.0, 0.0, 0.0, 0.0))
+    vehicle.attitude(4.0)
+    silent = link.wait_telemetry(4.0, 1.0)
+    assert (silent.ranged, silent.height_age_s) == (False, pytest.approx(2.1))
+    assert silent.height_m == pytest.approx(1.3)
+
+
+def test_a_rangefinder_too_near_the_ground_to_see_it_does_not_forbid_taking_off(met):
+    link, vehicle = met
+    vehicle.send(downward(1000, 130))
+    vehicle.attitude(3.0)
+    vehicle.heartbeat()
+    vehicle.heartbeat(PX4_OFFBOARD, armed=True)
+    vehicle.attitude(3.1)
+    told = link.wait_telemetry(3.1, 1.0)
+    assert (told.ranged, told.height_age_s, told.height_m) == (False, 0.0, 0.0)
+
+
+def test_without_heartbeats_the_telemetry_grows_old(met):
+    link, vehicle = met
+    vehicle.attitude(3.4)
+    assert link.wait_telemetry(3.4, 1.0).stamp == 3.4
+    vehicle.attitude(6.0)
+    assert link.wait_telemetry(6.0, 1.0).stamp == 3.5
+    vehicle.heartbeat()
+    vehicle.attitude(6.1)
+    assert link.wait_telemetry(6.1, 1.0).stamp == 6.1
+
+
+def test_another_address_is_not_obeyed_while_the_vehicle_speaks(met):
+    link, vehicle = met
+    impostor = Vehicle(link)
+    impostor.attitude(50.0)
+    impostor.socket.close()
+    vehicle.attitude(2.0)
+    assert link.wait_telemetry(2.0, 1.0).stamp == 2.0
+    assert link.dropped["foreign"] == 1
+    link.send_setpoint(Setpoint(), stamp=1.0)
+    assert vehicle.receive().get_type() == "SET_POSITION_TARGET_LOCAL_NED"
+
+
+def test_what_the_network_or_the_wire_cannot_take_is_counted(met):
+    link, vehicle = met
+    good = OdometryOut(1.0, Pose(0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0), 0.0, 0.01, 0.01, 0.01, 0.01, 0)
+    link.send_odometry(dataclasses.replace(good, yaw_variance=math.nan))
+    link.send_odometry(dataclasses.replace(good, stamp=-1.0))
+    link.send_odometry(dataclasses.replace(good, stamp=math.inf))
+    link.send_setpoint(Setpoint(vx=1e300), stamp=1.0)
+    link._peer = ("255.255.255.255", 9)  # a broadcast without leave: the system refuses it
+    link.send_setpoint(Setpoint(), stamp=1.0)
+    assert link.dropped["unsent"] == 5
+    assert not select.select([vehicle.socket], [], [], 0.0)[0]
+
+
 def test_a_position_that_is_no_longer_sent_is_no_longer_ok(met):
     link, vehicle = met
     vehicle.send(mavlink.MAVLink_local_position_ned_message(1100, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
@@ -227,6 +301,7 @@ def test_odometry_is_local_frd_with_finite_variances(met):
             velocity=(0.5, 0.25, 0.0),
             yaw_rate=0.5,
             position_variance=0.01,
+            height_variance=100.0,
             yaw_variance=0.02,
             velocity_variance=0.03,
             reset_counter=257,
@@ -237,7 +312,7 @@ def test_odometry_is_local_frd_with_finite_variances(met):
     assert (sent.x, sent.y, sent.z) == (5.0, 2.0, -1.0)  # north, east, down
     assert sent.q == pytest.approx([1.0, 0.0, 0.0, 0.0])  # facing north
     assert (sent.vx, sent.vy, sent.yawspeed) == (0.5, -0.25, -0.5)
-    assert [sent.pose_covariance[i] for i in (0, 6, 11, 20)] == pytest.approx([0.01, 0.01, 0.01, 0.02])
+    assert [sent.pose_covariance[i] for i in (0, 6, 11, 20)] == pytest.approx([0.01, 0.01, 100.0, 0.02])
     assert all(map(math.isfinite, [*sent.pose_covariance, *sent.velocity_covariance]))
     assert sent.reset_counter == 1
 

@@ -204,6 +204,12 @@ def test_silence_ends_as_failed_work():
         run_drone(wired())
 
 
+def test_a_report_that_cannot_be_written_does_not_hide_what_befell_the_flight(tmp_path, caplog):
+    with pytest.raises(WorkError, match="no LiDAR scan"):
+        run_drone(wired(report=tmp_path / "nowhere" / "report.json"))
+    assert "cannot be written" in caplog.text
+
+
 RUN = """
 import sys
 from imagine.onboard.process import run_drone
@@ -242,6 +248,8 @@ def test_a_real_process_answers_every_scan_and_heeds_sigterm(tmp_path):
             attitude = mavlink.MAVLink_attitude_message(100 * tick, 0.0, 0.0, 1.5708, 0.0, 0.0, 0.0)
             vehicle.sendto(attitude.pack(codec), companion)
             vehicle.sendto(b"\xfd noise", companion)
+            lidar_noise = b"noise"
+            vehicle.sendto(lidar_noise, lidar)
             vehicle.sendto(encode_scan(Scan(0.1 * tick, square_room(LD19, 2.0)), LD19), lidar)
             assert next_of("ODOMETRY", 5.0).time_usec == 100_000 * tick
             assert next_of("SET_POSITION_TARGET_LOCAL_NED", 5.0).time_boot_ms == 100 * tick
@@ -250,3 +258,5 @@ def test_a_real_process_answers_every_scan_and_heeds_sigterm(tmp_path):
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["setpoints"] == 5
     assert report["dropped"]["malformed"] == 5
+    assert report["dropped"]["lidar_malformed"] == 5
+    assert report["dropped"]["mesh_lost"] == 0

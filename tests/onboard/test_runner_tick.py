@@ -157,7 +157,7 @@ def test_the_policy_sees_what_its_contract_promises():
     ("policy", "words"),
     [
         (FixedPolicy((math.nan, 0.0)), "not finite"),
-        (FixedPolicy((1.0, 0.0, 0.0)), "not finite"),
+        (FixedPolicy((1.0, 0.0, 0.0)), "shape (3,), expected (2,)"),
         (FixedPolicy(error="policy inference failed: out of memory"), "out of memory"),
         (None, "no policy"),
     ],
@@ -247,6 +247,47 @@ def test_the_pilot_holds_resumes_and_lands_it_by_mesh():
         output = flight.tick(datagrams=tuple(ground.poll(flight.vehicle.now)))
         assert output.status.decider == decider
     assert VehicleCommand.LAND in output.commands
+
+
+@pytest.mark.parametrize("later", ["resume", "hold"])
+def test_no_later_order_takes_a_landing_back(later):
+    flight = FlatFlight(SETTINGS, FixedPolicy((0.2, 0.0)))
+    flight.runner, ground = mesh_pair(SETTINGS)
+    exploring(flight)
+    datagrams = []
+    for action in ("land", later):  # both arrive before the next tick
+        ground.send_command(action, 0, flight.vehicle.now)
+        datagrams += ground.poll(flight.vehicle.now)
+    assert VehicleCommand.LAND in flight.tick(datagrams=tuple(datagrams)).commands
+    done = flight.fly_until(lambda output: output.status.phase == "done", longest_s=10.0)
+    assert done.status.reason == "the pilot ordered landing"
+
+
+def test_a_rangefinder_that_falls_silent_stops_the_climb_and_then_lands_as_a_failsafe():
+    flight = FlatFlight(SETTINGS, FixedPolicy((0.2, 0.0)))
+    exploring(flight)
+    flight.vehicle.height = 0.6
+    told = flight.vehicle.telemetry
+    assert flight.tick().setpoint.vz > 0.0
+    silent_at = flight.vehicle.now
+
+    def without_rangefinder():
+        return replace(told(), ranged=False, height_age_s=flight.vehicle.now - silent_at)
+
+    flight.vehicle.telemetry = without_rangefinder
+    outputs = [flight.tick() for _ in range(32)]
+    assert all(output.setpoint.vz == 0.0 for output in outputs[5:])
+    assert VehicleCommand.LAND in outputs[-1].commands + outputs[-2].commands
+    assert any(e.kind == "failsafe" and "no height" in e.text for output in outputs for e in output.events)
+
+
+def test_a_height_that_is_the_autopilots_own_goes_back_to_it_with_a_wide_variance():
+    flight = FlatFlight(SETTINGS)
+    ranged = flight.tick().odometry
+    assert ranged.height_variance == ranged.position_variance
+    told = flight.vehicle.telemetry
+    flight.vehicle.telemetry = lambda: replace(told(), ranged=False)
+    assert flight.tick().odometry.height_variance >= 100.0
 
 
 def test_its_state_and_reason_reach_the_ground():

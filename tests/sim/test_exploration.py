@@ -21,7 +21,8 @@ from imagine.core.observation_spec import ObservationSpec
 from imagine.core.planner import plan_velocity
 from imagine.core.shield import shield_velocity
 from imagine.sim.coverage import Coverage
-from imagine.sim.exploration import Exploration, ExplorationSettings, Step
+from imagine.sim.exploration import Exploration, Step
+from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.level import load_level
 
 SMALL: dict[str, Any] = {

@@ -140,10 +140,10 @@ def test_a_level_can_add_to_another(tmp_path: Path) -> None:
     [
         ("size_m: [4, 4]\nlanch: [1, 1]\n", ":2: unknown key 'lanch'; did you mean 'launch'"),
         ("size_m: [4, 4]\n", ": key 'launch' is missing"),
-        ("launch: [1, 1]\n", ": (whole file): give either size_m or outline"),
+        ("launch: [1, 1]\n", ": give either size_m or outline"),
         ("size_m: [4, 4]\noutline: [[0, 0], [1, 0], [1, 1]]\nlaunch: [1, 1]\n", "give either size_m or outline"),
-        ("size_m: [4, 0.2]\nlaunch: [1, 1]\n", "size_m must lie within"),
-        ("size_m: [4, 4000]\nlaunch: [1, 1]\n", "size_m must lie within"),
+        ("size_m: [4, 0.2]\nlaunch: [1, 1]\n", "size_m: each side must lie within"),
+        ("size_m: [4, 4000]\nlaunch: [1, 1]\n", "size_m: each side must lie within"),
         ("size_m: [4, .inf]\nlaunch: [1, 1]\n", ":1: size_m.1: "),
         ("size_m: [4, 4]\nlaunch: [9, 9]\n", ":2: launch (9.0, 9.0) is in or within 0.25 m of a wall"),
         ("size_m: [4, 4]\nlaunch: [0.1, 2]\n", ":2: launch"),

@@ -16,7 +16,8 @@ from pettingzoo.test import parallel_api_test
 from imagine.core.contract import ActionSpec
 from imagine.core.errors import InputError
 from imagine.core.observation_spec import ObservationSpec
-from imagine.sim.exploration import Exploration, ExplorationSettings
+from imagine.sim.exploration import Exploration
+from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.parallel_env import ExplorationEnv
 
 SMALL = ExplorationSettings(

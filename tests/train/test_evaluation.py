@@ -5,7 +5,8 @@ import pytest
 
 from imagine.core.errors import InputError
 from imagine.core.observation_spec import ObservationSpec
-from imagine.sim.exploration import EpisodeMetrics, ExplorationSettings
+from imagine.sim.exploration import EpisodeMetrics
+from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.evaluation import bootstrap_interval, evaluate, named_policy, row
 from imagine.train.networks import Actor, NetworkSettings
 from imagine.train.policies import policy_of

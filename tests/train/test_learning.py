@@ -4,7 +4,8 @@ import torch
 
 from imagine.core.errors import WorkError
 from imagine.core.observation_spec import ObservationSpec
-from imagine.sim.exploration import Exploration, ExplorationSettings
+from imagine.sim.exploration import Exploration
+from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.imitation import ImitationSettings, LabelBuffer, collect_labels, imitation_loss, learn
 from imagine.train.networks import Actor, Critic, NetworkSettings, log_probability
 from imagine.train.ppo import Optimisers, PpoSettings, update

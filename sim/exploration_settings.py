@@ -1,0 +1,46 @@
+"""What can be set about exploration in the twin."""
+
+from __future__ import annotations
+
+from pydantic import Field, field_validator
+
+from imagine.core.config import Settings
+from imagine.core.contract import ActionSpec
+from imagine.core.lidar import PRESETS
+from imagine.core.mapping import MapSettings
+from imagine.core.observation_spec import ObservationSpec
+from imagine.core.vehicle_limits import VehicleLimits
+from imagine.mesh_comm.settings import Protocol
+
+
+class ExplorationSettings(Settings):
+    """What is explored, by whom, and what a policy sees and does."""
+
+    levels: tuple[str, ...] = Field(default=("0", "1", "2", "3", "4", "5", "6"), min_length=1)
+    level_weights: tuple[float, ...] | None = Field(default=None, description="share of episodes per level")
+    worlds: int = Field(default=24, ge=1, le=4096)
+    drones: int = Field(default=3, ge=1, le=16)
+    episode_ticks: int = Field(default=1000, ge=1)
+    stop_coverage: float = Field(default=0.995, gt=0.0, le=1.0, description="an episode ends when so much is covered")
+    random_launch: bool = Field(default=True, description="start anywhere, not at the level's launch point")
+    mirror: bool = Field(default=True, description="show levels mirrored and turned as well")
+    stagger: bool = Field(default=False, description="give first episodes different lengths, so resets spread out")
+    lidar: str = "ld19"
+    map: MapSettings = MapSettings()
+    limits: VehicleLimits = VehicleLimits()
+    observation: ObservationSpec = ObservationSpec()
+    action: ActionSpec = ActionSpec()
+    protocol: Protocol = "one-hop"
+    radio_range_m: float = Field(default=5.0, gt=0.0)
+    tiles_a_tick: int = Field(
+        default=20, ge=1, description="what 250 kbit/s carries in 0.1 s at about 150 bytes a tile"
+    )
+    reward_scale: float = Field(default=5.0, gt=0.0)
+    own_credit: float = Field(default=0.5, ge=0.0, le=1.0, description="share of the reward for own discoveries")
+
+    @field_validator("lidar")
+    @classmethod
+    def _known_lidar(cls, name: str) -> str:
+        if name not in PRESETS:
+            raise ValueError(f"unknown LiDAR; known: {', '.join(PRESETS)}")
+        return name
