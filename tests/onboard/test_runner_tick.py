@@ -320,12 +320,20 @@ def test_a_teammate_in_sight_is_not_mapped():
 
 
 def test_noise_from_the_radio_changes_nothing_but_a_counter():
-    runner, _ = mesh_pair(SETTINGS)
-    quiet, _ = mesh_pair(SETTINGS)
-    scan = Scan(0.1, ray_ranges(TWO_ROOMS, 1.5, 1.5, 0.4))
-    noisy = runner.tick(TickInput(0.1, scan, Telemetry(0.1), (b"", b"noise", bytes(1200))))
-    assert noisy.setpoint == quiet.tick(TickInput(0.1, scan, Telemetry(0.1))).setpoint
-    assert sum(runner.mesh.stats.values()) == 3
+    outputs = []
+    for datagrams in ((), (b"", b"noise", bytes(1200))):
+        flight = FlatFlight(SETTINGS)
+        flight.runner, _ = mesh_pair(SETTINGS)
+        exploring(flight)
+        flight.vehicle.advance(0.1)
+        before = sum(flight.runner.mesh.stats.values())
+        outputs.append(
+            flight.runner.tick(TickInput(flight.vehicle.now, flight.scan(), flight.vehicle.telemetry(), datagrams))
+        )
+        assert sum(flight.runner.mesh.stats.values()) == before + len(datagrams)
+    quiet, noisy = outputs
+    assert noisy.setpoint == quiet.setpoint
+    assert abs(noisy.setpoint.vx) + abs(noisy.setpoint.vy) > 0.1  # it flies
 
 
 def test_a_yaw_reset_of_the_autopilot_does_not_lose_track():
