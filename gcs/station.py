@@ -54,7 +54,7 @@ def run_station(
     `key` is the swarm's (`mesh_comm.keys.find_key`). `on_start` gets the page's address, `on_snapshot` five snapshots
     a second, both from this thread. Raises InputError on a link or port that cannot be opened.
     """
-    sealer = Sealer(key, GROUND, next_boot_number(_boot_file(settings.boot_file), time.time()))
+    sealer = Sealer(key, GROUND, next_boot_number(Path(settings.boot_file), time.time()))
     fleet = Fleet(settings.radio, sealer, range_cap_m=settings.map.range_cap_m)
     link = open_link(settings.mesh)
     try:
@@ -97,12 +97,3 @@ def obey(fleet: Fleet, server: GroundServer, now: float) -> None:
             fleet.command(request.command, request.target, now)
         except InputError as error:
             logger.warning("the page's request was refused: %s", error)
-
-
-def _boot_file(name: str) -> Path:
-    path = Path(name).expanduser()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path.parent}: cannot be made: {error.strerror}; set another boot_file") from error
-    return path
