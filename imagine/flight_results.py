@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine.onboard.ladder import Decider
+from imagine.onboard.report import SENT_KINDS
 from imagine.sim.server import TickRecord
 
-_KINDS = ("scan", "tile", "digest", "status")
-DECIDERS = ("policy", "frontier", "hold", "land")
+DECIDERS = tuple(rung.value for rung in Decider)
 
 
 @dataclass
@@ -72,7 +73,7 @@ def _drone(number: int, report: dict[str, Any] | None, death: str, log: FlightLo
         "own_cells": found.get("own_cells"),
         "scan_cells": found.get("scan_cells"),
         "map_cells": found.get("map_cells"),
-        "bytes_sent": found.get("bytes_sent", dict.fromkeys(_KINDS)),
+        "bytes_sent": found.get("bytes_sent", dict.fromkeys(SENT_KINDS)),
         "setpoints": found.get("setpoints"),
         "pose_rmse_m": pose_rmse(trajectory, log.truth, number - 1),
         "decided_by": found.get("decided_by", dict.fromkeys(DECIDERS, 0)),

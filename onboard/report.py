@@ -73,7 +73,7 @@ class FlightRecord:
             "own_cells": mesh.own_cells if mesh is not None else own,
             "scan_cells": mesh.scan_cells if mesh is not None else 0,
             "map_cells": mesh.map_cells if mesh is not None else 0,
-            "bytes_sent": dict(mesh.bytes_sent) if mesh is not None else dict.fromkeys(_KINDS, 0),
+            "bytes_sent": dict(mesh.bytes_sent) if mesh is not None else dict.fromkeys(SENT_KINDS, 0),
             "setpoints": self.setpoints,
             "decided_by": dict(self.decided_by),
             "failsafes": [_row(event) for event in self.events if event.kind == "failsafe"],
@@ -89,7 +89,7 @@ class FlightRecord:
         }
 
 
-_KINDS = ("scan", "tile", "digest", "status")
+SENT_KINDS = ("scan", "tile", "digest", "status")
 
 
 def write_report(path: Path, report: dict[str, Any]) -> None:

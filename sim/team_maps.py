@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from imagine.core.frontier import frontier_distances, plan_states
 from imagine.core.lidar import TEAMMATE_RADIUS_M
-from imagine.core.raster import TILE, integrate_scan, sum_layers
+from imagine.core.raster import CELL, TILE, integrate_scan, sum_layers
 from imagine.sim.workers import Workers
 
 
@@ -152,9 +152,9 @@ def _integrate_own(  # type: ignore[no-untyped-def]
 def _count_new(cells, seen, coverable, column0, row0, pose, range_cap):  # type: ignore[no-untyped-def]
     """Mark what a drone knows around it as seen; return how many coverable cells nobody had seen before."""
     rows, columns = cells.shape
-    reach = math.ceil(range_cap / 0.1) + 1
-    column = math.floor(pose[0] / 0.1) - column0
-    row = math.floor(pose[1] / 0.1) - row0
+    reach = math.ceil(range_cap / CELL) + 1
+    column = math.floor(pose[0] / CELL) - column0
+    row = math.floor(pose[1] / CELL) - row0
     fresh = 0
     for i in range(max(0, row - reach), min(rows, row + reach + 1)):
         for j in range(max(0, column - reach), min(columns, column + reach + 1)):

@@ -2,6 +2,6 @@
 
 import os
 
-# Numba's threads and torch's OpenMP pool spin against each other while idle (a rollout step takes fifteen times as
-# long). OpenMP reads this once, when it is loaded: it must stand before the first import of torch.
+# Torch's idle OpenMP threads would spin on the cores that the twin's threads need. OpenMP reads this once, when it is
+# loaded: it must stand before the first import of torch.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -17,7 +17,7 @@ from imagine.train.policies import Policy, load_policy
 
 MAX_WORLDS = 16
 BYTES_PER_TILE = 150
-"""A tile of the evidence map on the air: compressed cells, version and seal, as measured over whole flights."""
+"""What a tile of the evidence map is taken to cost on the air; assumed, and scans, digests and status are left out."""
 _RESAMPLES = 2000
 
 

@@ -135,7 +135,7 @@ class Trainer:
         if self.resumed is not None:
             self.env.load_state_dict(self.resumed.env)
         self._observation = self.env.reset()
-        # Not before the environment has worked: numba, when it starts, sets OpenMP's thread count, which torch obeys.
+        # Set here, whatever OMP_NUM_THREADS says: sums are split by thread, and equal settings must give equal runs.
         torch.set_num_threads(self.settings.run.threads or len(os.sched_getaffinity(0)))
         self.learner = Learner.create(self.settings)
         self.episodes = RecentEpisodes(self.settings.env.episode_ticks)
