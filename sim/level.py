@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
@@ -54,6 +54,20 @@ class Circle(Settings):
     radius: float = Field(gt=0.0)
 
 
+class Person(Settings):
+    """Someone who walks a closed loop of waypoints, again and again."""
+
+    loop: list[Point] = Field(min_length=2)
+    speed_mps: float = Field(default=0.8, gt=0.0, le=3.0)
+    radius: float = Field(default=0.25, gt=0.0, le=1.0)
+
+
+class Crate(Box):
+    """A box that can be pushed; `mass_kg` says how hard it is."""
+
+    mass_kg: float = Field(default=2.0, gt=0.0, le=100.0)
+
+
 class LevelFile(Settings):
     """What a level's YAML holds."""
 
@@ -66,6 +80,8 @@ class LevelFile(Settings):
     walls: list[list[Point]] = Field(default_factory=list, description="polylines")
     boxes: list[Box] = Field(default_factory=list)
     circles: list[Circle] = Field(default_factory=list)
+    people: list[Person] = Field(default_factory=list)
+    crates: list[Crate] = Field(default_factory=list)
 
     @field_validator("size_m")
     @classmethod
@@ -93,6 +109,9 @@ class LevelFile(Settings):
 class Level:
     """A level's geometry: `outline` `[n, 2]`, convex `polygons` (each `[k, 2]`) and `circles` `[m, 3]` (x, y, radius).
 
+    `solids` are closed loops of any simple shape, solid inside, such as the walls of a scanned map; `people` and
+    `crates` move, and are no part of what has to be covered.
+
     Metres in the map frame, whose origin is the level's own.
     """
 
@@ -102,11 +121,14 @@ class Level:
     polygons: tuple[NDArray[np.float64], ...]
     circles: NDArray[np.float64]
     launch: Point
+    solids: tuple[NDArray[np.float64], ...] = ()
+    people: tuple[Person, ...] = ()
+    crates: tuple[Crate, ...] = ()
 
     @cached_property
     def segments(self) -> NDArray[np.float64]:
         """All edges a ray can hit, `[segments, 4]` (x0, y0, x1, y1)."""
-        loops = [self.outline, *self.polygons]
+        loops = [self.outline, *self.polygons, *self.solids]
         return np.concatenate([np.hstack((loop, np.roll(loop, -1, axis=0))) for loop in loops])
 
     @cached_property
@@ -120,7 +142,7 @@ class Level:
     def is_free(self, points: NDArray[np.float64], clearance_m: float = 0.0) -> NDArray[np.bool_]:
         """Tell which points `[n, 2]` lie inside the outline, outside all obstacles, and `clearance_m` off any edge."""
         free = _inside(self.outline, points)
-        for polygon in self.polygons:
+        for polygon in (*self.polygons, *self.solids):
             free &= ~_inside(polygon, points)
         for x, y, radius in self.circles:
             free &= np.hypot(points[:, 0] - x, points[:, 1] - y) > radius + clearance_m
@@ -212,7 +234,11 @@ def _build(name: str, where: str, data: dict[str, Any], lines: dict[KeyPath, int
         polygons = [*base.polygons, *polygons]
         circles = np.concatenate((base.circles, circles))
     _check_extent(file, where, lines)
-    level = Level(name, file.title, outline, tuple(polygons), circles, launch)
+    people, crates = tuple(file.people), tuple(file.crates)
+    solids: tuple[NDArray[np.float64], ...] = ()
+    if base is not None:
+        people, crates, solids = (*base.people, *people), (*base.crates, *crates), base.solids
+    level = Level(name, file.title, outline, tuple(polygons), circles, launch, solids, people, crates)
     if not level.is_free(np.array([launch]), _LAUNCH_CLEARANCE_M)[0]:
         raise InputError(
             f"{where}:{lines.get(('launch',), 1)}: launch {launch} is in or within {_LAUNCH_CLEARANCE_M} m of a wall"
@@ -323,4 +349,18 @@ def mirrored(level: Level, swap_axes: bool, flip_x: bool, flip_y: bool) -> Level
         tuple(move(polygon) for polygon in level.polygons),
         np.hstack((move(level.circles[:, :2]), level.circles[:, 2:])),
         (float(launch[0]), float(launch[1])),
+        tuple(move(solid) for solid in level.solids),
+        tuple(
+            p.model_copy(update={"loop": [(float(x), float(y)) for x, y in move(np.array(p.loop))]})
+            for p in level.people
+        ),
+        tuple(_mirrored_crate(crate, move, swap_axes, flip_x != flip_y) for crate in level.crates),
     )
+
+
+def _mirrored_crate(
+    crate: Crate, move: Callable[[NDArray[np.float64]], NDArray[np.float64]], swap_axes: bool, flipped_once: bool
+) -> Crate:
+    x, y = move(np.array([crate.center]))[0]
+    yaw_deg = 90.0 - crate.yaw_deg if swap_axes else crate.yaw_deg
+    return crate.model_copy(update={"center": (float(x), float(y)), "yaw_deg": -yaw_deg if flipped_once else yaw_deg})

@@ -20,7 +20,7 @@ from imagine.core.frames import Pose
 from imagine.core.lidar import LD19, LidarSpec
 from imagine.core.vehicle_limits import VehicleLimits
 from imagine.sim.level import Level
-from imagine.sim.rays import add_noise, cast_rays
+from imagine.sim.sensing import Sensing
 from imagine.sim.workers import Workers
 
 TICK_S = 0.1
@@ -36,9 +36,6 @@ _ARBITER_FIELDS = (
     | pymunk.batch.ArbiterFields.BODY_B_ID
     | pymunk.batch.ArbiterFields.IS_FIRST_CONTACT
 )
-
-
-_Geometry = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
 
 
 class Twin:
@@ -83,7 +80,7 @@ class Twin:
         self._forces = pymunk.batch.Buffer()
         self._motion = pymunk.batch.Buffer()
         self._arbiters = pymunk.batch.Buffer()
-        self._geometry: _Geometry | None = None
+        self._sensing = Sensing(self.worlds, drones, lidar, seed, self.workers)
         for world, level in enumerate(levels):
             self.set_level(world, level, level.launch_poses(drones))
 
@@ -117,7 +114,7 @@ class Twin:
         self._space.add(*shapes)
         self._statics[world] = shapes
         self.levels[world] = level
-        self._geometry = None
+        self._sensing.set_level(world, level)
         self.poses[world] = poses
         self.velocity[world] = 0.0
         self.contacts[world] = 0
@@ -180,33 +177,7 @@ class Twin:
 
         Ranges in metres with the sensor's noise; inf no return, nan below the least range.
         """
-        ranges = np.empty((self.worlds, self.drones, self.lidar.beams), np.float32)
-        keys = np.array([self.noise_key(world) for world in range(self.worlds)], np.uint64)
-        if self._geometry is None:
-            self._geometry = _stack([level.segments for level in self.levels], [lv.circles for lv in self.levels])
-        segments, segment_counts, circles, circle_counts = self._geometry
-        lidar = self.lidar
-        self.workers.over(
-            self.worlds, _scan_worlds, ranges, segments, segment_counts, circles, circle_counts, self.poses,
-            self.limits.radius_m, (lidar.start, lidar.increment, lidar.range_min, lidar.range_max, lidar.noise_std),
-            keys,
-        )  # fmt: skip
-        return ranges
-
-    def noise_key(self, world: int) -> int:
-        """Return the number that this tick's sensor noise of a world is drawn from."""
-        return ((self.seed * 1_000_003 + world) * 1_000_003 + self.ticks) % 2**64
-
-
-def _stack(segments: list[NDArray[np.float64]], circles: list[NDArray[np.float64]]) -> _Geometry:
-    """Lay ragged geometry of all worlds into arrays `[worlds, most, 4]` and `[worlds, most, 3]` with their counts."""
-    segment_counts = np.array([len(s) for s in segments])
-    circle_counts = np.array([len(c) for c in circles])
-    all_segments = np.zeros((len(segments), segment_counts.max(), 4))
-    all_circles = np.zeros((len(circles), circle_counts.max(), 3))
-    for world, (s, c) in enumerate(zip(segments, circles, strict=True)):
-        all_segments[world, : len(s)], all_circles[world, : len(c)] = s, c
-    return all_segments, segment_counts, all_circles, circle_counts
+        return self._sensing.scan(self.poses, self.limits.radius_m, self.ticks)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -228,37 +199,3 @@ def _control(forces, velocity, yaw, wanted, dt, lag, acceleration, speed, fastes
         rate = min(max(wanted[k, 2], -fastest_yaw), fastest_yaw)
         velocity[k, 2] += (rate - velocity[k, 2]) * blend
         yaw[k] += velocity[k, 2] * dt
-
-
-@numba.njit(cache=True, nogil=True)
-def _scan_worlds(  # type: ignore[no-untyped-def]
-    first, last, ranges, segments, segment_counts, circles, circle_counts, poses, drone_radius, lidar, keys
-):
-    """Fill `ranges` (float32 `[worlds, drones, beams]`) of worlds first to last.
-
-    They see the level, the other drones, and noise drawn from the world's key.
-    """
-    start, increment, range_min, range_max, noise_std = lidar
-    _, drones, beams = ranges.shape
-    for index in range(first * drones, last * drones):
-        world, drone = index // drones, index % drones
-        posts = circle_counts[world]
-        round_things = np.empty((posts + drones - 1, 3))
-        for post in range(posts):
-            for k in range(3):
-                round_things[post, k] = circles[world, post, k]
-        count = posts
-        for other in range(drones):
-            if other != drone:
-                round_things[count, 0], round_things[count, 1] = poses[world, other, 0], poses[world, other, 1]
-                round_things[count, 2] = drone_radius
-                count += 1
-        exact = np.empty(beams)
-        x, y, yaw = poses[world, drone]
-        cast_rays(
-            exact, segments[world, : segment_counts[world]], round_things, x, y, yaw + start, increment, range_max
-        )
-        key = keys[world] * np.uint64(drones) + np.uint64(drone)
-        add_noise(exact, key, noise_std, range_min, range_max)
-        for beam in range(beams):
-            ranges[world, drone, beam] = exact[beam]
