@@ -2,209 +2,377 @@
 
 A frontier is known free space beside unknown space (Yamauchi 1997). The field lives on a 0.2 m planning grid, two
 cells of the map to a side: a quarter of the work, and still two free cells in the narrowest passage a drone may use.
+
+From tick to tick few cells change their distance, so the grid is kept up to date: `refresh_states` where the belief
+changed, `refresh_kinds` around that, and `update_costs`, which repairs the shortest paths (after Ramalingam and Reps
+1996: first the paths that lost their support are dropped, then Dijkstra's search runs from what is left). Shortest
+distances are unique, so this gives the very numbers of a search from nothing, which is what happens on board.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.raster import CELL
+from imagine.core.raster import CELL, TILE
 
 PLAN_CELL = 2 * CELL
 """Side of a planning cell, metres."""
+PLAN_TILE = TILE // 2
+"""Side of a tile, planning cells."""
+PAD = 2
+"""Cells of unknown around a planning grid, which spare the loops every test for the edge."""
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+UNIT_M = 0.04
+"""Costs are whole numbers of this, metres."""
+FAR = 32767
+"""Cost of what no path from a frontier was found to."""
+BLOCKED = -1
+"""Cost of what cannot be flown through."""
 
-_STRAIGHT, _DIAGONAL = 10, 14  # edge lengths in fiftieths of a metre: 0.20 m and 0.28 m
-_UNITS_PER_M = 50.0
+_STRAIGHT, _DIAGONAL = 5, 7  # 0.20 m and 0.28 m
 _NEAR_WALL_COST = 3  # beside an obstacle a metre costs three: paths keep clear of walls where there is room
-_BUCKETS = 64  # above the longest edge, 3 * 14
-_FAR = 2**30
-_GAP = 3  # free, but too narrow to fly through
+_NEAR, _FRONTIER, _OPEN = 1, 2, 4  # bits of a cell's kind
 
 
 @dataclass(frozen=True)
 class FrontierField:
-    """Frontier distances and cell states on the planning grid, `[rows, columns]`.
+    """Frontier distances and cell states on the planning grid, both with PAD cells of unknown around it.
 
-    `distance`: float32 metres along the cheapest known path, a metre beside obstacles counting threefold; inf where no
-    frontier can be reached. `states`: uint8 UNKNOWN, FREE or OCCUPIED. Row 0, column 0 is the map grid's first cell.
+    `cost`: int16 `[rows + 2 PAD, columns + 2 PAD]`, UNIT_M along the cheapest known path, a metre beside obstacles
+    counting threefold; FAR where no frontier can be reached, BLOCKED where nothing flies. `padded_states`: uint8 of
+    the same shape, UNKNOWN, FREE or OCCUPIED.
     """
 
-    distance: NDArray[np.float32]
-    states: NDArray[np.uint8]
+    cost: NDArray[np.int16]
+    padded_states: NDArray[np.uint8]
+
+    @cached_property
+    def distance(self) -> NDArray[np.float32]:
+        """Frontier distance, float32 `[rows, columns]` metres; inf where no frontier can be reached."""
+        distance = np.empty(self.states.shape, np.float32)
+        fill_distance(self.cost, distance)
+        return distance
+
+    @property
+    def states(self) -> NDArray[np.uint8]:
+        """Cell states, `[rows, columns]`; row 0, column 0 is the map grid's first cell."""
+        return self.padded_states[PAD:-PAD, PAD:-PAD]
 
 
 @numba.njit(cache=True, nogil=True)
-def plan_states(belief, states):  # type: ignore[no-untyped-def]
-    """Reduce a belief (int8 `[2 r, 2 c]`) to planning cells (uint8 `[r, c]`): occupied before free before unknown."""
-    rows, columns = states.shape
-    for row in range(rows):
-        upper, lower = belief[2 * row], belief[2 * row + 1]
-        for column in range(columns):
-            a, b = upper[2 * column], upper[2 * column + 1]
-            c, d = lower[2 * column], lower[2 * column + 1]
-            occupied = (a > 0) | (b > 0) | (c > 0) | (d > 0)
-            free = (a < 0) | (b < 0) | (c < 0) | (d < 0)
-            states[row, column] = OCCUPIED if occupied else (FREE if free else UNKNOWN)
+def refresh_states(belief, states, tile_row, tile_column):  # type: ignore[no-untyped-def]
+    """Reduce a tile of a belief (int8 `[rows, columns]`) to planning cells: occupied before free before unknown.
+
+    `states` is padded. Return the planning cells that changed as (first row, last row, first column, last column) of
+    the padded grid, the first row past the last where none did.
+    """
+    first_row, last_row, first_column, last_column = 1 << 30, -1, 1 << 30, -1
+    fresh = np.empty(PLAN_TILE, np.uint8)
+    for i in range(PLAN_TILE):
+        upper, lower = belief[tile_row * TILE + 2 * i], belief[tile_row * TILE + 2 * i + 1]
+        row = tile_row * PLAN_TILE + i + PAD
+        out = states[row]
+        differing = np.uint8(0)
+        for j in range(PLAN_TILE):
+            k = np.uint64(tile_column * TILE + 2 * j)
+            a, b = upper[k], upper[k + np.uint64(1)]
+            c, d = lower[k], lower[k + np.uint64(1)]
+            a, c = (a if a > b else b), (c if c > d else d)
+            highest = a if a > c else c
+            a, b = upper[k], upper[k + np.uint64(1)]
+            c, d = lower[k], lower[k + np.uint64(1)]
+            a, c = (a if a < b else b), (c if c < d else d)
+            lowest = a if a < c else c
+            free = np.uint8(FREE) if lowest < 0 else np.uint8(UNKNOWN)
+            state = np.uint8(OCCUPIED) if highest > 0 else free
+            fresh[j] = state
+            differing = np.uint8(differing | (state ^ out[np.uint64(tile_column * PLAN_TILE + j + PAD)]))
+        if differing == 0:
+            continue
+        first_row, last_row = min(first_row, row), row
+        for j in range(PLAN_TILE):
+            column = tile_column * PLAN_TILE + j + PAD
+            if out[column] != fresh[j]:
+                out[column] = fresh[j]
+                first_column, last_column = min(first_column, column), max(last_column, column)
+    return first_row, last_row, first_column, last_column
 
 
 @numba.njit(cache=True, nogil=True)
-def _squeezed(padded, cell, width):  # type: ignore[no-untyped-def]
+def _squeezed(states, row, column):  # type: ignore[no-untyped-def]
     """Tell whether obstacles lie on two opposite sides of a cell, straight or diagonal."""
     return (
-        (padded[cell - 1] == OCCUPIED and padded[cell + 1] == OCCUPIED)
-        or (padded[cell - width] == OCCUPIED and padded[cell + width] == OCCUPIED)
-        or (padded[cell - width - 1] == OCCUPIED and padded[cell + width + 1] == OCCUPIED)
-        or (padded[cell - width + 1] == OCCUPIED and padded[cell + width - 1] == OCCUPIED)
+        (states[row, column - 1] == OCCUPIED and states[row, column + 1] == OCCUPIED)
+        or (states[row - 1, column] == OCCUPIED and states[row + 1, column] == OCCUPIED)
+        or (states[row - 1, column - 1] == OCCUPIED and states[row + 1, column + 1] == OCCUPIED)
+        or (states[row - 1, column + 1] == OCCUPIED and states[row + 1, column - 1] == OCCUPIED)
     )
 
 
 @numba.njit(cache=True, nogil=True)
-def _opens(padded, cell, width):  # type: ignore[no-untyped-def]
+def _opens(states, row, column):  # type: ignore[no-untyped-def]
     """Tell whether a cell is unknown, with unknown beside it and no obstacles on two sides.
 
     Lone unknown cells, and chinks in what is surely a wall, are not worth a flight.
     """
-    if padded[cell] != UNKNOWN or _squeezed(padded, cell, width):
+    rows, columns = states.shape
+    if states[row, column] != UNKNOWN or not (0 < row < rows - 1 and 0 < column < columns - 1):
         return False
-    return (
-        padded[cell - 1] == UNKNOWN
-        or padded[cell + 1] == UNKNOWN
-        or padded[cell - width - 1] == UNKNOWN
-        or padded[cell - width] == UNKNOWN
-        or padded[cell - width + 1] == UNKNOWN
-        or padded[cell + width - 1] == UNKNOWN
-        or padded[cell + width] == UNKNOWN
-        or padded[cell + width + 1] == UNKNOWN
-    )
+    if _squeezed(states, row, column):
+        return False
+    for i in range(row - 1, row + 2):
+        for j in range(column - 1, column + 2):
+            if states[i, j] == UNKNOWN and (i != row or j != column):
+                return True
+    return False
 
 
 @numba.njit(cache=True, nogil=True)
-def frontier_distances(states, distance):  # type: ignore[no-untyped-def]
-    """Fill `distance` (float32, as `FrontierField.distance`) by Dial's bucket-queue Dijkstra from all frontiers."""
+def refresh_kinds(states, kinds, cost, changed, dirty, count, is_dirty):  # type: ignore[no-untyped-def]
+    """Bring `kinds` (uint8) up to date around states that changed, and note the cells whose paths it may change.
+
+    A kind says whether a drone can fly there, whether an obstacle is beside it, and whether it is a frontier. All
+    grids are padded; `changed` is what `refresh_states` returned, once all states are in place. What opens or closes
+    gets the cost FAR or BLOCKED. `dirty` holds `count` flat cells, `is_dirty` (uint8, flat) their marks; return the
+    new count.
+    """
     rows, columns = states.shape
-    width = columns + 4  # two cells of unknown all around spare the loops every test for the edge
-    size = (rows + 4) * width
-    padded = np.zeros(size, dtype=np.uint8)
-    weight = np.ones(size, dtype=np.int32)
-    cost = np.full(size, _FAR, dtype=np.int32)
-    for row in range(rows):
-        first = (row + 2) * width + 2
-        for column in range(columns):
-            state = states[row, column]
-            padded[first + column] = state
-            if state == OCCUPIED:
-                for beside in (-width, 0, width):
-                    cell = first + column + beside
-                    weight[cell - 1] = weight[cell] = weight[cell + 1] = _NEAR_WALL_COST
+    first_row, last_row, first_column, last_column = changed
+    for row in range(max(PAD, first_row - 2), min(rows - PAD, last_row + 3)):
+        for column in range(max(PAD, first_column - 2), min(columns - PAD, last_column + 3)):
+            kind = np.uint8(_kind(states, row, column))
+            old = kinds[row, column]
+            if kind == old:
+                continue
+            kinds[row, column] = kind
+            if (kind ^ old) & _OPEN:
+                cost[row, column] = FAR if kind & _OPEN else BLOCKED
+            reach = 1 if (kind ^ old) & (_OPEN | _NEAR) else 0  # a frontier's flag is its own affair
+            for i in range(row - reach, row + reach + 1):
+                for j in range(column - reach, column + reach + 1):
+                    cell = i * columns + j
+                    if is_dirty[cell] == 0:
+                        is_dirty[cell] = 1
+                        dirty[count] = cell
+                        count += 1
+    return count
 
-    for row in range(rows):  # a cell squeezed between obstacles is a gap of 0.2 m: nothing flies through
-        first = (row + 2) * width + 2
-        for cell in range(first, first + columns):
-            if weight[cell] > 1 and padded[cell] == FREE and _squeezed(padded, cell, width):
-                padded[cell] = _GAP
 
-    heads = np.full(_BUCKETS, -1, dtype=np.int32)
-    entry_cell = np.empty(9 * size + 1, dtype=np.int32)  # each settled cell relaxes at most 8 edges
-    entry_next = np.empty(9 * size + 1, dtype=np.int32)
-    entries = 0
-    for row in range(rows):
-        first = (row + 2) * width + 2
-        for cell in range(first, first + columns):
-            if padded[cell] == FREE and (
-                _opens(padded, cell - 1, width)
-                or _opens(padded, cell + 1, width)
-                or _opens(padded, cell - width, width)
-                or _opens(padded, cell + width, width)
-            ):
-                cost[cell] = 0
-                entry_cell[entries] = cell
-                entry_next[entries] = heads[0]
-                heads[0] = entries
-                entries += 1
+@numba.njit(cache=True, nogil=True)
+def _kind(states, row, column):  # type: ignore[no-untyped-def]
+    if states[row, column] != FREE:
+        return 0
+    near = False
+    for i in range(row - 1, row + 2):
+        for j in range(column - 1, column + 2):
+            near |= states[i, j] == OCCUPIED
+    if near and _squeezed(states, row, column):  # a gap of 0.2 m: nothing flies through
+        return 0
+    frontier = (
+        _opens(states, row, column - 1)
+        or _opens(states, row, column + 1)
+        or _opens(states, row - 1, column)
+        or _opens(states, row + 1, column)
+    )
+    return _OPEN | (_NEAR if near else 0) | (_FRONTIER if frontier else 0)
 
-    level, queued = 0, entries
-    while queued > 0:
-        bucket = level % _BUCKETS
-        while heads[bucket] >= 0:
-            entry = heads[bucket]
-            heads[bucket] = entry_next[entry]
-            queued -= 1
-            cell = entry_cell[entry]
-            if cost[cell] != level:
-                continue  # a shorter way was found since
-            north, south = padded[cell + width] == FREE, padded[cell - width] == FREE
-            east, west = padded[cell + 1] == FREE, padded[cell - 1] == FREE
+
+@numba.njit(cache=True, nogil=True)
+def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[no-untyped-def]
+    """Repair `cost` (int16, padded) around the first `count` cells of `dirty`, whose marks are taken off.
+
+    `scratch` is `search_scratch` for a grid of this size.
+    """
+    heads, entry_cell, entry_next = scratch
+    width = cost.shape[1]
+    costs, flat_kinds = cost.ravel(), kinds.ravel()
+    entries, lowest = 0, FAR
+    for k in range(count):
+        cell = dirty[k]
+        old = np.int64(costs[cell])
+        if 0 <= old < FAR:
+            entry_cell[entries], entry_next[entries], heads[old] = cell, heads[old], entries
+            entries += 1
+            lowest = min(lowest, old)
+    count = _drop_unsupported(costs, flat_kinds, width, lowest, entries, dirty, count, is_dirty, scratch)
+    steps = _steps(width)
+    entries, lowest = 0, FAR
+    for k in range(count):
+        cell = dirty[k]
+        is_dirty[cell] = 0
+        kind = flat_kinds[cell]
+        if not kind & _OPEN:
+            continue
+        found = 0
+        if not kind & _FRONTIER:
+            found = FAR
             for way in range(8):
-                if way < 4:
-                    step = _STRAIGHT
-                    if way == 0:
-                        other, passable = cell + width, north
-                    elif way == 1:
-                        other, passable = cell - width, south
-                    elif way == 2:
-                        other, passable = cell + 1, east
-                    else:
-                        other, passable = cell - 1, west
-                else:  # a diagonal step cuts no corner: both cells beside it must be free
-                    step = _DIAGONAL
-                    if way == 4:
-                        other, passable = cell + width + 1, north and east
-                    elif way == 5:
-                        other, passable = cell + width - 1, north and west
-                    elif way == 6:
-                        other, passable = cell - width + 1, south and east
-                    else:
-                        other, passable = cell - width - 1, south and west
-                    passable = passable and padded[other] == FREE
-                if not passable:
+                other = np.uint32(cell + steps[way])
+                c = np.int64(costs[other])
+                if c < 0 or c >= found or (way > 3 and (costs[np.uint32(cell + steps[way & 1])] < 0 or
+                                           costs[np.uint32(cell + steps[2 + (way >> 1 & 1)])] < 0)):
                     continue
-                reached = level + step * max(weight[other], weight[cell])
-                if reached < cost[other]:
-                    cost[other] = reached
-                    target = reached % _BUCKETS
-                    entry_cell[entries] = other
-                    entry_next[entries] = heads[target]
-                    heads[target] = entries
+                step = _STRAIGHT if way < 4 else _DIAGONAL
+                found = min(found, c + (step * _NEAR_WALL_COST if (kind | flat_kinds[other]) & _NEAR else step))
+        if found < costs[cell]:
+            costs[cell] = found
+            entry_cell[entries], entry_next[entries], heads[found] = cell, heads[found], entries
+            entries += 1
+            lowest = min(lowest, found)
+    _settle(costs, flat_kinds, width, lowest, entries, scratch)
+
+
+@numba.njit(cache=True, nogil=True)
+def _steps(width):  # type: ignore[no-untyped-def]
+    """Return the ways to the neighbours: 0 east, 1 west, 2 north, 3 south; 4 + (0 or 1) + 2 (0 or 1) between them."""
+    return np.array([1, -1, width, -width, width + 1, width - 1, -width + 1, -width - 1])
+
+
+@numba.njit(cache=True, nogil=True)
+def _drop_unsupported(  # type: ignore[no-untyped-def]
+    costs, kinds, width, level, queued, dirty, count, is_dirty, scratch
+):
+    """Set to FAR, from the queued cells on, what no neighbour's cost explains any more; note it, return the count.
+
+    Cells come by their old cost, so that what may support a cell has been looked at before it.
+    """
+    heads, entry_cell, entry_next = scratch
+    steps = _steps(width)
+    entries = queued
+    reached, others = np.empty(8, np.int64), np.empty(8, np.uint32)
+    while queued > 0:
+        while heads[level] >= 0:
+            entry = heads[level]
+            heads[level] = entry_next[entry]
+            queued -= 1
+            cell = np.uint32(entry_cell[entry])
+            if costs[cell] != level:
+                continue  # it came twice, and was dropped the first time
+            kind = kinds[cell]
+            supported = level == 0 and kind & _FRONTIER != 0
+            ways = 0
+            for way in range(8):
+                other = np.uint32(cell + steps[way])
+                c = np.int64(costs[other])
+                if c < 0 or (way > 3 and (costs[np.uint32(cell + steps[way & 1])] < 0 or
+                                          costs[np.uint32(cell + steps[2 + (way >> 1 & 1)])] < 0)):
+                    continue
+                step = _STRAIGHT if way < 4 else _DIAGONAL
+                if (kind | kinds[other]) & np.uint8(_NEAR):
+                    step *= _NEAR_WALL_COST
+                if c + step <= level:
+                    supported = True
+                    break
+                if c == level + step:  # its path may come this way
+                    others[ways], reached[ways] = other, c
+                    ways += 1
+            if supported:
+                continue
+            costs[cell] = FAR
+            if is_dirty[cell] == 0:
+                is_dirty[cell] = 1
+                dirty[count] = cell
+                count += 1
+            for k in range(ways):
+                target = reached[k]
+                entry_cell[entries], entry_next[entries], heads[target] = others[k], heads[target], entries
+                entries += 1
+            queued += ways
+        level += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(costs, kinds, width, level, queued, scratch):  # type: ignore[no-untyped-def]
+    """Carry lowered costs on from the queued cells: Dijkstra's search with a queue for every cost (Dial 1969)."""
+    heads, entry_cell, entry_next = scratch
+    steps = _steps(width)
+    entries = queued
+    while queued > 0:
+        while heads[level] >= 0:
+            entry = heads[level]
+            heads[level] = entry_next[entry]
+            queued -= 1
+            cell = np.uint32(entry_cell[entry])
+            if costs[cell] != level:
+                continue  # a shorter way was found since
+            kind = kinds[cell]
+            for way in range(8):
+                step = _STRAIGHT if way < 4 else _DIAGONAL
+                other = np.uint32(cell + steps[way])
+                if costs[other] <= level + step:  # BLOCKED is below all
+                    continue
+                # a diagonal step cuts no corner: both cells beside it must be free
+                if way > 3 and (costs[np.uint32(cell + steps[way & 1])] < 0 or
+                                costs[np.uint32(cell + steps[2 + (way >> 1 & 1)])] < 0):
+                    continue
+                reached = level + (step * _NEAR_WALL_COST if (kind | kinds[other]) & np.uint8(_NEAR) else step)
+                if reached < costs[other]:
+                    costs[other] = reached
+                    entry_cell[entries], entry_next[entries], heads[reached] = other, heads[reached], entries
                     entries += 1
                     queued += 1
         level += 1
 
-    per_unit = np.float32(1.0 / _UNITS_PER_M)
-    for row in range(rows):
-        first = (row + 2) * width + 2
-        for column in range(columns):
-            c = cost[first + column]
-            distance[row, column] = np.float32(np.inf) if c == _FAR else np.float32(c) * per_unit
+
+def search_scratch(cells: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """Return what `update_costs` works with on a padded grid of so many cells; one for each thread."""
+    entries = 9 * cells + 1  # each settled cell relaxes at most 8 edges
+    return np.full(FAR + 1, -1, np.int32), np.empty(entries, np.int32), np.empty(entries, np.int32)
 
 
 @numba.njit(cache=True, nogil=True)
-def distance_at(distance, column, row):  # type: ignore[no-untyped-def]
-    """Return the frontier distance at a planning cell, or the least one within two cells where it has none."""
+def fill_distance(cost, distance):  # type: ignore[no-untyped-def]
+    """Write padded costs (int16) as metres into `distance` (float32 `[rows, columns]`), inf where none was found."""
     rows, columns = distance.shape
-    best = np.float32(np.inf)
+    for row in range(rows):
+        for column in range(columns):
+            c = cost[row + PAD, column + PAD]
+            distance[row, column] = np.float32(c) * np.float32(UNIT_M) if 0 <= c < FAR else np.float32(np.inf)
+
+
+@numba.njit(cache=True, nogil=True)
+def cost_at(cost, column, row):  # type: ignore[no-untyped-def]
+    """Return the cost at a planning cell of the unpadded grid, or the least within two cells where it has none; FAR."""
+    rows, columns = cost.shape[0] - 2 * PAD, cost.shape[1] - 2 * PAD
+    best = FAR
     for ring in range(3):
         for i in range(max(0, row - ring), min(rows, row + ring + 1)):
             for j in range(max(0, column - ring), min(columns, column + ring + 1)):
-                best = min(best, distance[i, j])
-        if best < np.inf:
+                c = cost[i + PAD, j + PAD]
+                if 0 <= c < best:
+                    best = np.int64(c)
+        if best < FAR:
             break
     return best
 
 
 def frontier_field(belief: NDArray[np.int8]) -> FrontierField:
-    """Return the frontier field of a belief (int8 `[rows, columns]`, both even)."""
-    rows, columns = belief.shape[0] // 2, belief.shape[1] // 2
-    states = np.empty((rows, columns), np.uint8)
-    distance = np.empty((rows, columns), np.float32)
-    plan_states(belief, states)
-    frontier_distances(states, distance)
-    return FrontierField(distance, states)
+    """Return the frontier field of a belief (int8 `[rows, columns]`, both even); beyond it all is unknown."""
+    plan_rows, plan_columns = belief.shape[0] // 2, belief.shape[1] // 2
+    belief = np.pad(belief, ((0, -belief.shape[0] % TILE), (0, -belief.shape[1] % TILE)))
+    rows, columns = belief.shape[0] // 2 + 2 * PAD, belief.shape[1] // 2 + 2 * PAD
+    states, kinds = np.zeros((rows, columns), np.uint8), np.zeros((rows, columns), np.uint8)
+    cost = np.full((rows, columns), BLOCKED, np.int16)
+    dirty, is_dirty = np.empty(cost.size, np.int32), np.zeros(cost.size, np.uint8)
+    _field_from_nothing(belief, states, kinds, cost, dirty, is_dirty, search_scratch(cost.size))
+    inner = slice(plan_rows + 2 * PAD), slice(plan_columns + 2 * PAD)
+    return FrontierField(np.ascontiguousarray(cost[inner]), np.ascontiguousarray(states[inner]))
+
+
+@numba.njit(cache=True, nogil=True)
+def _field_from_nothing(belief, states, kinds, cost, dirty, is_dirty, scratch):  # type: ignore[no-untyped-def]
+    for i in range(belief.shape[0] // TILE):
+        for j in range(belief.shape[1] // TILE):
+            refresh_states(belief, states, i, j)
+    count = refresh_kinds(states, kinds, cost, (0, states.shape[0], 0, states.shape[1]), dirty, 0, is_dirty)
+    update_costs(cost, kinds, dirty, count, is_dirty, scratch)
 
 
 def plan_cell(x: float, y: float, origin_cells: tuple[int, int]) -> tuple[int, int]:
@@ -218,4 +386,5 @@ def plan_cell(x: float, y: float, origin_cells: tuple[int, int]) -> tuple[int, i
 def own_distance(field: FrontierField, origin_cells: tuple[int, int], x: float, y: float) -> float:
     """Return the frontier distance of the drone at (x, y), metres; inf where nothing is left to explore."""
     column, row = plan_cell(x, y, origin_cells)
-    return float(distance_at(field.distance, column, row))
+    cost = cost_at(field.cost, column, row)
+    return float(cost) * UNIT_M if cost < FAR else math.inf

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from imagine.core.frames import Pose
-from imagine.core.frontier import FREE, OCCUPIED, PLAN_CELL, UNKNOWN, FrontierField, distance_at, plan_cell
+from imagine.core.frontier import FAR, FREE, OCCUPIED, PAD, PLAN_CELL, UNKNOWN, FrontierField
 from imagine.core.lidar import LidarSpec, Scan
 
 _LOOKAHEAD_CELLS = 8
@@ -37,39 +37,39 @@ def _clear(states, row0, column0, row1, column1):  # type: ignore[no-untyped-def
 
 
 @numba.njit(cache=True, nogil=True)
-def _nearest_valued(distance, row, column):  # type: ignore[no-untyped-def]
-    """Return the planning cell to start from: the drone's own, or the one of least distance within two cells."""
-    rows, columns = distance.shape
+def _nearest_valued(cost, row, column):  # type: ignore[no-untyped-def]
+    """Return the planning cell to start from: the drone's own, or the one of least cost within two cells."""
+    rows, columns = cost.shape
     for ring in range(3):
-        best_row, best_column, best = -1, -1, np.inf
+        best_row, best_column, best = -1, -1, FAR
         for i in range(max(0, row - ring), min(rows, row + ring + 1)):
             for j in range(max(0, column - ring), min(columns, column + ring + 1)):
-                if distance[i, j] < best:
-                    best_row, best_column, best = i, j, distance[i, j]
+                if 0 <= cost[i, j] < best:
+                    best_row, best_column, best = i, j, np.int64(cost[i, j])
         if best_row >= 0:
             return best_row, best_column
     return -1, -1
 
 
 @numba.njit(cache=True, nogil=True)
-def plan_direction(distance, states, column, row, x, y):  # type: ignore[no-untyped-def]
+def plan_direction(cost, states, column, row, x, y):  # type: ignore[no-untyped-def]
     """Return (dx, dy, found): the unit vector from (x, y) toward the nearest frontier.
 
-    (x, y) are in planning cells from the grid's first cell, (column, row) the cell that holds them.
+    (x, y) are in planning cells from the padded grid's first cell, (column, row) the cell that holds them.
     """
-    rows, columns = distance.shape
-    at_row, at_column = _nearest_valued(distance, row, column)
+    rows, columns = cost.shape
+    at_row, at_column = _nearest_valued(cost, row, column)
     if at_row < 0:
         return 0.0, 0.0, False
     goal_row, goal_column = at_row, at_column
     for _ in range(_LOOKAHEAD_CELLS):
-        best_row, best_column, best = -1, -1, distance[at_row, at_column]
+        best_row, best_column, best = -1, -1, cost[at_row, at_column]
         for i in range(max(0, at_row - 1), min(rows, at_row + 2)):
             for j in range(max(0, at_column - 1), min(columns, at_column + 2)):
                 if i != at_row and j != at_column and (states[i, at_column] != FREE or states[at_row, j] != FREE):
                     continue
-                if distance[i, j] < best:
-                    best_row, best_column, best = i, j, distance[i, j]
+                if 0 <= cost[i, j] < best:
+                    best_row, best_column, best = i, j, cost[i, j]
         if best_row < 0:
             break
         at_row, at_column = best_row, best_column
@@ -77,7 +77,7 @@ def plan_direction(distance, states, column, row, x, y):  # type: ignore[no-unty
             break
         goal_row, goal_column = at_row, at_column
     dx, dy = goal_column + 0.5 - x, goal_row + 0.5 - y
-    if distance[goal_row, goal_column] == 0.0 and abs(goal_row - row) <= 1 and abs(goal_column - column) <= 1:
+    if cost[goal_row, goal_column] == 0 and abs(goal_row - row) <= 1 and abs(goal_column - column) <= 1:
         # On the frontier itself: go on toward what is unknown beyond it.
         for i in range(max(0, goal_row - 1), min(rows, goal_row + 2)):
             for j in range(max(0, goal_column - 1), min(columns, goal_column + 2)):
@@ -106,11 +106,14 @@ def wall_repulsion(ranges, range_min, start, increment, yaw):  # type: ignore[no
 
 
 @numba.njit(cache=True, nogil=True)
-def plan_kernel(distance, states, column0, row0, x, y, yaw, ranges, range_min, start, increment):  # type: ignore[no-untyped-def]
-    """Return (ux, uy, found) in the map frame, length at most 1; (column0, row0) is the grid's origin in map cells."""
-    px, py = x / PLAN_CELL - column0 // 2, y / PLAN_CELL - row0 // 2
+def plan_kernel(cost, states, column0, row0, x, y, yaw, ranges, range_min, start, increment):  # type: ignore[no-untyped-def]
+    """Return (ux, uy, found) in the map frame, length at most 1; (column0, row0) is the grid's origin in map cells.
+
+    `cost` and `states` are padded as in `FrontierField`.
+    """
+    px, py = x / PLAN_CELL - column0 // 2 + PAD, y / PLAN_CELL - row0 // 2 + PAD
     column, row = math.floor(px), math.floor(py)
-    dx, dy, found = plan_direction(distance, states, column, row, px, py)
+    dx, dy, found = plan_direction(cost, states, column, row, px, py)
     if not found:
         return 0.0, 0.0, False
     push_x, push_y = wall_repulsion(ranges, range_min, start, increment, yaw)
@@ -131,13 +134,7 @@ def plan_velocity(
 ) -> tuple[float, float] | None:
     """Return the map-frame velocity (m/s) toward the nearest frontier, or None where none can be reached."""
     ux, uy, found = plan_kernel(
-        field.distance, field.states, origin_cells[0], origin_cells[1], pose.x, pose.y, pose.yaw,
+        field.cost, field.padded_states, origin_cells[0], origin_cells[1], pose.x, pose.y, pose.yaw,
         scan.ranges, lidar.range_min, lidar.start, lidar.increment,
     )  # fmt: skip
     return (ux * speed_mps, uy * speed_mps) if found else None
-
-
-def frontier_reachable(field: FrontierField, origin_cells: tuple[int, int], pose: Pose) -> bool:
-    """Tell whether known free space leads from the drone to any frontier."""
-    column, row = plan_cell(pose.x, pose.y, origin_cells)
-    return bool(np.isfinite(distance_at(field.distance, column, row)))

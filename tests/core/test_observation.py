@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from imagine.core.frames import Pose
-from imagine.core.frontier import FrontierField, frontier_field
+from imagine.core.frontier import BLOCKED, PAD, FrontierField, frontier_field
 from imagine.core.lidar import LD19, LidarSpec, Scan
 from imagine.core.observation import observe
 from imagine.core.observation_spec import ObservationSpec
@@ -116,9 +116,10 @@ def test_outside_the_map_all_is_unknown_and_far() -> None:
 @given(METRES, METRES, SEEDS)
 def test_frontier_pixels_are_relative_to_the_drones_own_cell(x: float, y: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    distance = rng.uniform(0.0, 3.0, (64, 64)).astype(np.float32)
-    distance[rng.random((64, 64)) < 0.2] = np.inf
-    field = FrontierField(distance, np.ones((64, 64), np.uint8))
+    cost = np.full((64 + 2 * PAD, 64 + 2 * PAD), BLOCKED, np.int16)
+    cost[PAD:-PAD, PAD:-PAD] = np.where(rng.random((64, 64)) < 0.2, BLOCKED, rng.integers(0, 75, (64, 64)))
+    field = FrontierField(cost, np.ones(cost.shape, np.uint8))
+    distance = field.distance
     views = see(SPEC, blank(), Pose(x, y, 0.0), field=field)["views"]
     plan_row, plan_column = math.floor(y / 0.2) + 32, math.floor(x / 0.2) + 32
     own = distance[plan_row, plan_column]
@@ -128,13 +129,13 @@ def test_frontier_pixels_are_relative_to_the_drones_own_cell(x: float, y: float,
     if not np.isfinite(own):
         return
     for i, j in ((0, 0), (3, 12), (9, 9), (15, 1)):
-        column = math.floor((x + (j + 0.5 - 8) * 0.1) / 0.1) + 64
-        row = math.floor((y + (i + 0.5 - 8) * 0.1) / 0.1) + 64
+        column = math.floor(x / 0.1 + 0.5) - 8 + j + 64
+        row = math.floor(y / 0.1 + 0.5) - 8 + i + 64
         there = distance[row // 2, column // 2]
         expected = np.clip(there - own, -1.0, 1.0) if np.isfinite(there) else 1.0
         assert views[1][i, j] == pytest.approx(expected, abs=1e-6)
-        block_column = math.floor((x + (j + 0.5 - 8) * 0.4) / 0.4) * 2 + 32
-        block_row = math.floor((y + (i + 0.5 - 8) * 0.4) / 0.4) * 2 + 32
+        block_column = (math.floor(x / 0.4 + 0.5) - 8 + j) * 2 + 32
+        block_row = (math.floor(y / 0.4 + 0.5) - 8 + i) * 2 + 32
         there = distance[block_row : block_row + 2, block_column : block_column + 2].min()
         expected = np.clip((there - own) / 4.0, -1.0, 1.0) if np.isfinite(there) else 1.0
         assert views[3][i, j] == pytest.approx(expected, abs=1e-6)

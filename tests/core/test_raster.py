@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from imagine.core.raster import CELL, HIT, LIMIT, MISS, TILE, integrate_scan, probability, sum_layers
+from imagine.core.raster import CELL, HIT, LIMIT, MISS, RANGE_STEP_M, TILE, integrate_scan, probability, sum_layers
 
 SIDE = 128  # 12.8 m, the map's origin in the middle
 ORIGIN = -SIDE // 2
@@ -35,6 +35,13 @@ def empty() -> NDArray[np.int8]:
     return np.zeros((SIDE, SIDE), np.int8)
 
 
+def ends_at(x: float, y: float, yaw: float, bearing: float, r: float) -> tuple[int, int]:
+    """Return the cell that a return at `r`, rounded to the centimetre as all mapped ranges are, falls into."""
+    r = float(np.float32(min(max(round(float(np.float32(r)) / RANGE_STEP_M), 1), CAP_M / RANGE_STEP_M) * RANGE_STEP_M))
+    c, s, cb, sb = math.cos(yaw), math.sin(yaw), math.cos(bearing), math.sin(bearing)
+    return cell_of(x + r * (c * cb - s * sb), y + r * (s * cb + c * sb))
+
+
 def cell_of(x: float, y: float) -> tuple[int, int]:
     return math.floor(y / CELL) - ORIGIN, math.floor(x / CELL) - ORIGIN
 
@@ -43,9 +50,8 @@ def cell_of(x: float, y: float) -> tuple[int, int]:
 def test_a_beam_frees_its_line_and_marks_its_end(x: float, y: float, yaw: float, distance: float) -> None:
     cells = empty()
     draw(cells, x, y, yaw, [distance])
-    r = float(np.float32(distance))
     row0, column0 = cell_of(x, y)
-    row1, column1 = cell_of(x + r * math.cos(yaw), y + r * math.sin(yaw))
+    row1, column1 = ends_at(x, y, yaw, 0.0, distance)
     assert cells[row1, column1] == HIT
     rows, columns = np.nonzero(cells == MISS)
     assert len(rows) == max(abs(row1 - row0), abs(column1 - column0)) == np.count_nonzero(cells) - 1
@@ -87,8 +93,7 @@ def test_a_cell_takes_at_most_one_update_a_scan_and_a_hit_wins(
     hits = np.zeros((SIDE, SIDE), bool)
     for beam, r in enumerate(np.array(ranges, np.float32).astype(float)):
         if 0.05 <= r <= CAP_M:
-            bearing = yaw + beam * (2 * math.pi / len(ranges))
-            hits[cell_of(x + r * math.cos(bearing), y + r * math.sin(bearing))] = True
+            hits[ends_at(x, y, yaw, beam * (2 * math.pi / len(ranges)), r)] = True
     expected_hit = np.minimum(before.astype(int) + HIT, LIMIT)
     expected_miss = np.maximum(before.astype(int) + MISS, -LIMIT)
     assert (cells[hits] == expected_hit[hits]).all()
