@@ -28,6 +28,7 @@ PLAN_TILE = TILE // 2
 PAD = 2
 """Cells of unknown around a planning grid, which spare the loops every test for the edge."""
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+"""States of a planning cell; OCCUPIED is a bit of its own."""
 UNIT_M = 0.04
 """Costs are whole numbers of this, metres."""
 FAR = 32767
@@ -117,12 +118,12 @@ def _squeezed(states, row, column):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _opens(states, row, column):  # type: ignore[no-untyped-def]
-    """Tell whether a cell is unknown, with unknown beside it and no obstacles on two sides.
+    """Tell whether an unknown cell has unknown beside it and no obstacles on two sides.
 
     Lone unknown cells, and chinks in what is surely a wall, are not worth a flight.
     """
     rows, columns = states.shape
-    if states[row, column] != UNKNOWN or not (0 < row < rows - 1 and 0 < column < columns - 1):
+    if not (0 < row < rows - 1 and 0 < column < columns - 1):
         return False
     if _squeezed(states, row, column):
         return False
@@ -146,7 +147,24 @@ def refresh_kinds(states, kinds, cost, changed, dirty, count, is_dirty):  # type
     first_row, last_row, first_column, last_column = changed
     for row in range(max(PAD, first_row - 2), min(rows - PAD, last_row + 3)):
         for column in range(max(PAD, first_column - 2), min(columns - PAD, last_column + 3)):
-            kind = np.uint8(_kind(states, row, column))
+            kind = np.uint8(0)
+            if states[row, column] == FREE:
+                w, e = states[row, column - 1], states[row, column + 1]
+                s, n = states[row - 1, column], states[row + 1, column]
+                sw, se = states[row - 1, column - 1], states[row - 1, column + 1]
+                nw, ne = states[row + 1, column - 1], states[row + 1, column + 1]
+                kind = np.uint8(_OPEN)
+                if ((w | e | s | n | sw | se | nw | ne) & OCCUPIED) != 0:
+                    kind = np.uint8(_OPEN | _NEAR)
+                    if (w & e & OCCUPIED) | (s & n & OCCUPIED) | (sw & ne & OCCUPIED) | (nw & se & OCCUPIED):
+                        kind = np.uint8(0)  # a gap of 0.2 m: nothing flies through
+                if kind != 0 and (
+                    (w == UNKNOWN and _opens(states, row, column - 1))
+                    or (e == UNKNOWN and _opens(states, row, column + 1))
+                    or (s == UNKNOWN and _opens(states, row - 1, column))
+                    or (n == UNKNOWN and _opens(states, row + 1, column))
+                ):
+                    kind |= np.uint8(_FRONTIER)
             old = kinds[row, column]
             if kind == old:
                 continue
@@ -162,25 +180,6 @@ def refresh_kinds(states, kinds, cost, changed, dirty, count, is_dirty):  # type
                         dirty[count] = cell
                         count += 1
     return count
-
-
-@numba.njit(cache=True, nogil=True)
-def _kind(states, row, column):  # type: ignore[no-untyped-def]
-    if states[row, column] != FREE:
-        return 0
-    near = False
-    for i in range(row - 1, row + 2):
-        for j in range(column - 1, column + 2):
-            near |= states[i, j] == OCCUPIED
-    if near and _squeezed(states, row, column):  # a gap of 0.2 m: nothing flies through
-        return 0
-    frontier = (
-        _opens(states, row, column - 1)
-        or _opens(states, row, column + 1)
-        or _opens(states, row - 1, column)
-        or _opens(states, row + 1, column)
-    )
-    return _OPEN | (_NEAR if near else 0) | (_FRONTIER if frontier else 0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -201,25 +200,14 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
             entries += 1
             lowest = min(lowest, old)
     count = _drop_unsupported(costs, flat_kinds, width, lowest, entries, dirty, count, is_dirty, scratch)
-    steps = _steps(width)
     entries, lowest = 0, FAR
     for k in range(count):
-        cell = dirty[k]
+        cell = np.uint32(dirty[k])
         is_dirty[cell] = 0
         kind = flat_kinds[cell]
-        if not kind & _OPEN:
+        if not kind & np.uint8(_OPEN):
             continue
-        found = 0
-        if not kind & _FRONTIER:
-            found = FAR
-            for way in range(8):
-                other = np.uint32(cell + steps[way])
-                c = np.int64(costs[other])
-                if c < 0 or c >= found or (way > 3 and (costs[np.uint32(cell + steps[way & 1])] < 0 or
-                                           costs[np.uint32(cell + steps[2 + (way >> 1 & 1)])] < 0)):
-                    continue
-                step = _STRAIGHT if way < 4 else _DIAGONAL
-                found = min(found, c + (step * _NEAR_WALL_COST if (kind | flat_kinds[other]) & _NEAR else step))
+        found = 0 if kind & np.uint8(_FRONTIER) else _least(costs, flat_kinds, cell, np.uint32(width))
         if found < costs[cell]:
             costs[cell] = found
             entry_cell[entries], entry_next[entries], heads[found] = cell, heads[found], entries
@@ -228,10 +216,35 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
     _settle(costs, flat_kinds, width, lowest, entries, scratch)
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _via(cost, kinds, step):  # type: ignore[no-untyped-def]
+    """Return what a cell costs by way of a neighbour of this cost; `kinds` are both cells' kinds, or-ed."""
+    step = step * _NEAR_WALL_COST if kinds & np.uint8(_NEAR) else step
+    return np.int64(cost) + step if cost >= 0 else np.int64(FAR)
+
+
 @numba.njit(cache=True, nogil=True)
-def _steps(width):  # type: ignore[no-untyped-def]
-    """Return the ways to the neighbours: 0 east, 1 west, 2 north, 3 south; 4 + (0 or 1) + 2 (0 or 1) between them."""
-    return np.array([1, -1, width, -width, width + 1, width - 1, -width + 1, -width - 1])
+def _least(costs, kinds, cell, width):  # type: ignore[no-untyped-def]
+    """Return the least cost of a cell by way of its neighbours, FAR or more where none has any. Without branches."""
+    one = np.uint32(1)
+    e, w, n, s = np.uint32(cell + one), np.uint32(cell - one), np.uint32(cell + width), np.uint32(cell - width)
+    ne, nw, se, sw = np.uint32(n + one), np.uint32(n - one), np.uint32(s + one), np.uint32(s - one)
+    kind = kinds[cell]
+    east, west, north, south = costs[e], costs[w], costs[n], costs[s]
+    blocked = np.int16(BLOCKED)  # a diagonal step cuts no corner: both cells beside it must be free
+    north_east = costs[ne] if (north >= 0) & (east >= 0) else blocked
+    north_west = costs[nw] if (north >= 0) & (west >= 0) else blocked
+    south_east = costs[se] if (south >= 0) & (east >= 0) else blocked
+    south_west = costs[sw] if (south >= 0) & (west >= 0) else blocked
+    straight = min(
+        min(_via(east, kind | kinds[e], _STRAIGHT), _via(west, kind | kinds[w], _STRAIGHT)),
+        min(_via(north, kind | kinds[n], _STRAIGHT), _via(south, kind | kinds[s], _STRAIGHT)),
+    )
+    diagonal = min(
+        min(_via(north_east, kind | kinds[ne], _DIAGONAL), _via(north_west, kind | kinds[nw], _DIAGONAL)),
+        min(_via(south_east, kind | kinds[se], _DIAGONAL), _via(south_west, kind | kinds[sw], _DIAGONAL)),
+    )
+    return min(straight, diagonal)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -245,7 +258,6 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
     heads, entry_cell, entry_next = scratch
     steps = _steps(width)
     entries = queued
-    reached, others = np.empty(8, np.int64), np.empty(8, np.uint32)
     while queued > 0:
         while heads[level] >= 0:
             entry = heads[level]
@@ -255,37 +267,36 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
             if costs[cell] != level:
                 continue  # it came twice, and was dropped the first time
             kind = kinds[cell]
-            supported = level == 0 and kind & _FRONTIER != 0
-            ways = 0
-            for way in range(8):
-                other = np.uint32(cell + steps[way])
-                c = np.int64(costs[other])
-                if c < 0 or (way > 3 and (costs[np.uint32(cell + steps[way & 1])] < 0 or
-                                          costs[np.uint32(cell + steps[2 + (way >> 1 & 1)])] < 0)):
+            if level == 0:
+                if kind & np.uint8(_FRONTIER):
                     continue
-                step = _STRAIGHT if way < 4 else _DIAGONAL
-                if (kind | kinds[other]) & np.uint8(_NEAR):
-                    step *= _NEAR_WALL_COST
-                if c + step <= level:
-                    supported = True
-                    break
-                if c == level + step:  # its path may come this way
-                    others[ways], reached[ways] = other, c
-                    ways += 1
-            if supported:
+            elif _least(costs, kinds, cell, np.uint32(width)) <= level:
                 continue
             costs[cell] = FAR
             if is_dirty[cell] == 0:
                 is_dirty[cell] = 1
                 dirty[count] = cell
                 count += 1
-            for k in range(ways):
-                target = reached[k]
-                entry_cell[entries], entry_next[entries], heads[target] = others[k], heads[target], entries
-                entries += 1
-            queued += ways
+            for way in range(8):
+                other = np.uint32(cell + steps[way])
+                c = np.int64(costs[other])
+                step = _STRAIGHT if way < 4 else _DIAGONAL
+                if c < level + step or c == FAR:
+                    continue
+                # corners are not looked at: what did not come this way just proves supported
+                target = level + (step * _NEAR_WALL_COST if (kind | kinds[other]) & np.uint8(_NEAR) else step)
+                if c == target:  # its path may come this way
+                    entry_cell[entries], entry_next[entries], heads[target] = other, heads[target], entries
+                    entries += 1
+                    queued += 1
         level += 1
     return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _steps(width):  # type: ignore[no-untyped-def]
+    """Return the ways to the neighbours: east, west, north, south, then between them in the same order of bits."""
+    return np.array([1, -1, width, -width, width + 1, width - 1, -width + 1, -width - 1])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -309,8 +320,9 @@ def _settle(costs, kinds, width, level, queued, scratch):  # type: ignore[no-unt
                 if costs[other] <= level + step:  # BLOCKED is below all
                     continue
                 # a diagonal step cuts no corner: both cells beside it must be free
-                if way > 3 and (costs[np.uint32(cell + steps[way & 1])] < 0 or
-                                costs[np.uint32(cell + steps[2 + (way >> 1 & 1)])] < 0):
+                if way > 3 and (
+                    costs[np.uint32(cell + steps[way & 1])] < 0 or costs[np.uint32(cell + steps[2 + (way >> 1 & 1)])] < 0
+                ):
                     continue
                 reached = level + (step * _NEAR_WALL_COST if (kind | kinds[other]) & np.uint8(_NEAR) else step)
                 if reached < costs[other]:

@@ -42,80 +42,117 @@ def fill_views(  # type: ignore[no-untyped-def]
 def _fill_aligned(  # type: ignore[no-untyped-def]
     occupancy, frontier, belief, cost, column0, row0, x, y, scale, own, per_unit
 ):
-    """Fill a scale's two channels along the map's axes: row by row, for rows of pixels are rows of cells."""
+    """Fill a scale's two channels along the map's axes: row by row, for rows of pixels are rows of cells.
+
+    Loops run over flat arrays without branches and with indices without a sign: these compile to vector instructions.
+    """
     rows, columns = belief.shape
     n = occupancy.shape[0]
     block = round(scale / CELL)
     column = (math.floor(x / scale + 0.5) - n // 2) * block - column0
     row = (math.floor(y / scale + 0.5) - n // 2) * block - row0
-    first = min(n, max(0, -(column // block)))  # pixels within the grid; both are multiples of the block
-    last = max(first, min(n, (columns - column) // block))
-    highest, total = np.empty(n * block, np.int8), np.empty(n * block, np.int16)
-    least = np.empty(n * block, np.int16)
+    first, first_row = min(n, max(0, -(column // block))), min(n, max(0, -(row // block)))
+    count = max(0, min(n, (columns - column) // block) - first)  # pixels within the grid, of which both are multiples
+    last_row = min(n, (rows - row) // block)
+    out, near = occupancy.ravel(), frontier.ravel()
+    out[:] = 0.0
+    near[:] = 1.0
+    if count == 0 or last_row <= first_row:
+        return
+    begin = column + first * block
+    cells = belief.ravel()
     per_limit = np.float32(1.0 / (LIMIT * block * block))
-    for i in range(n):
-        occupancy[i] = 0.0
-        frontier[i] = 1.0
-        at = row + i * block
-        if at < 0 or at + block > rows:
-            continue
-        out, near = occupancy[i], frontier[i]
-        begin = column + first * block
-        width = (last - first) * block
-        line = belief[at]
-        if block == 1:
-            for j in range(width):
-                out[np.uint64(first + j)] = np.float32(line[np.uint64(begin + j)]) * per_limit
-        else:
-            for j in range(width):
-                highest[j] = line[np.uint64(begin + j)]
-                total[j] = line[np.uint64(begin + j)]
-            for lower in range(1, block):
-                line = belief[at + lower]
-                for j in range(width):
-                    c = line[np.uint64(begin + j)]
-                    highest[j] = c if c > highest[j] else highest[j]
-                    total[j] = np.int16(total[j] + c)
-            for j in range(last - first):
-                strongest, mean = np.int8(-LIMIT), np.int16(0)
-                for k in range(j * block, (j + 1) * block):
-                    strongest = highest[k] if highest[k] > strongest else strongest
-                    mean = np.int16(mean + total[k])
-                value = np.int16(strongest * block * block) if strongest > 0 else mean
-                out[np.uint64(first + j)] = np.float32(value) * per_limit
-        if own >= FAR:
-            continue
-        plan_first = (begin >> 1) + PAD
-        plan_row = (at >> 1) + PAD
-        if block == 1:
-            line_cost = cost[plan_row]
-            odd = begin & 1
-            for j in range(width):
-                c = line_cost[np.uint64(plan_first + ((j + odd) >> 1))]
+    if block == 1:
+        for i in range(first_row, last_row):
+            line, target = (row + i) * columns + begin, i * n + first
+            for j in range(count):
+                out[np.uint64(target + j)] = np.float32(cells[np.uint64(line + j)]) * per_limit
+    else:
+        _fill_blocks(out, cells, columns, row, begin, first, count, first_row, last_row, block, per_limit, n)
+    if own >= FAR:
+        return
+    plan_width, plan_block = cost.shape[1], max(1, block // 2)
+    costs = cost.ravel()
+    odd_row, odd = (row + first_row * block) & 1, begin & 1  # at the finest scale two pixels share a planning cell
+    plan_rows = last_row - first_row if block > 1 else (last_row - first_row + odd_row + 1) // 2
+    plan_count = count if block > 1 else (count + odd + 1) // 2
+    corner = (((row + first_row * block) >> 1) + PAD) * plan_width + (begin >> 1) + PAD
+    low = np.empty(plan_rows * plan_count * plan_block, np.int16)
+    for i in range(plan_rows):
+        target, line = i * plan_count * plan_block, corner + i * plan_block * plan_width
+        for j in range(plan_count * plan_block):
+            c = costs[np.uint64(line + j)]
+            low[np.uint64(target + j)] = c if c >= 0 else np.int16(FAR)
+        for _ in range(1, plan_block):
+            line += plan_width
+            for j in range(plan_count * plan_block):
+                c, least = costs[np.uint64(line + j)], low[np.uint64(target + j)]
                 c = c if c >= 0 else np.int16(FAR)
-                relative = np.float32(np.int32(c) - np.int32(own)) * per_unit
-                relative = relative if relative < np.float32(1.0) else np.float32(1.0)
-                near[np.uint64(first + j)] = relative if relative > np.float32(-1.0) else np.float32(-1.0)
+                low[np.uint64(target + j)] = c if c < least else least
+    side = plan_block
+    while side > 1:  # neighbours in pairs, until a block is one number
+        half = np.empty(len(low) // 2, np.int16)
+        for j in range(len(half)):
+            a, b = low[np.uint64(2 * j)], low[np.uint64(2 * j + 1)]
+            half[np.uint64(j)] = a if a < b else b
+        low, side = half, side // 2
+    relative = np.empty(len(low), np.float32)
+    for j in range(len(low)):
+        further = np.float32(np.int32(low[np.uint64(j)]) - np.int32(own)) * per_unit
+        further = further if further < np.float32(1.0) else np.float32(1.0)
+        relative[np.uint64(j)] = further if further > np.float32(-1.0) else np.float32(-1.0)
+    for i in range(last_row - first_row):
+        target = (first_row + i) * n + first
+        line = i * count if block > 1 else ((i + odd_row) >> 1) * plan_count
+        if block > 1:
+            for j in range(count):
+                near[np.uint64(target + j)] = relative[np.uint64(line + j)]
         else:
-            plan_block = block // 2
-            plan_width = width // 2
-            line_cost = cost[plan_row]
-            for j in range(plan_width):
-                c = line_cost[np.uint64(plan_first + j)]
-                least[j] = c if c >= 0 else np.int16(FAR)
-            for lower in range(1, plan_block):
-                line_cost = cost[plan_row + lower]
-                for j in range(plan_width):
-                    c = line_cost[np.uint64(plan_first + j)]
-                    c = c if c >= 0 else np.int16(FAR)
-                    least[j] = c if c < least[j] else least[j]
-            for j in range(last - first):
-                c = np.int16(FAR)
-                for k in range(j * plan_block, (j + 1) * plan_block):
-                    c = least[k] if least[k] < c else c
-                relative = np.float32(np.int32(c) - np.int32(own)) * per_unit
-                relative = relative if relative < np.float32(1.0) else np.float32(1.0)
-                near[np.uint64(first + j)] = relative if relative > np.float32(-1.0) else np.float32(-1.0)
+            for j in range(count):
+                near[np.uint64(target + j)] = relative[np.uint64(line + ((j + odd) >> 1))]
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_blocks(  # type: ignore[no-untyped-def]
+    out, cells, columns, row, begin, first, count, first_row, last_row, block, per_limit, n
+):
+    """Fill the occupancy of pixels that are blocks of cells: the strongest obstacle, or else the mean."""
+    width = count * block
+    high, sums = np.empty((last_row - first_row) * width, np.int8), np.empty((last_row - first_row) * width, np.int8)
+    for i in range(last_row - first_row):
+        target, line = i * width, (row + (first_row + i) * block) * columns + begin
+        for j in range(width):
+            high[np.uint64(target + j)] = cells[np.uint64(line + j)]
+            sums[np.uint64(target + j)] = cells[np.uint64(line + j)]
+        for _ in range(1, block):
+            line += columns
+            for j in range(width):
+                c, strongest = cells[np.uint64(line + j)], high[np.uint64(target + j)]
+                high[np.uint64(target + j)] = c if c > strongest else strongest
+                sums[np.uint64(target + j)] = np.int8(sums[np.uint64(target + j)] + c)
+    total = np.empty(len(sums) // 2, np.int16)
+    for j in range(len(total)):
+        total[np.uint64(j)] = np.int16(np.int16(sums[np.uint64(2 * j)]) + np.int16(sums[np.uint64(2 * j + 1)]))
+    side = block // 2
+    while side > 1:
+        half = np.empty(len(total) // 2, np.int16)
+        for j in range(len(half)):
+            half[np.uint64(j)] = np.int16(total[np.uint64(2 * j)] + total[np.uint64(2 * j + 1)])
+        total, side = half, side // 2
+    side = block
+    while side > 1:
+        top = np.empty(len(high) // 2, np.int8)
+        for j in range(len(top)):
+            a, b = high[np.uint64(2 * j)], high[np.uint64(2 * j + 1)]
+            top[np.uint64(j)] = a if a > b else b
+        high, side = top, side // 2
+    for i in range(last_row - first_row):
+        target, line = (first_row + i) * n + first, i * count
+        for j in range(count):
+            strongest = np.int16(high[np.uint64(line + j)])
+            value = np.int16(strongest * np.int16(block * block))
+            value = value if strongest > 0 else total[np.uint64(line + j)]
+            out[np.uint64(target + j)] = np.float32(value) * per_limit
 
 
 @numba.njit(cache=True, nogil=True)

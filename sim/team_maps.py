@@ -1,210 +1,269 @@
 """What every drone of every world knows: evidence layers per source, beliefs and frontier fields, in numba.
 
-The kernels are those that fly (`imagine.core`), called in a loop over worlds that runs on all cores. Worlds share one
-grid size, that of the largest level; arrays are `[world, drone, source, row, column]`.
+The kernels are those that fly (`imagine.core`). From tick to tick little of a map changes, so everything derived from
+it is brought up to date only where tiles of it changed. Worlds share one grid size, that of the largest level; arrays
+are `[world, drone, source, row, column]`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.frontier import frontier_distances, plan_states
-from imagine.core.lidar import TEAMMATE_RADIUS_M
-from imagine.core.raster import CELL, TILE, integrate_scan, sum_layers
+from imagine.core.frontier import BLOCKED, PAD, refresh_kinds, refresh_states, search_scratch, update_costs
+from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec
+from imagine.core.raster import LIMIT, TILE, apply_marks, beam_directions, mark_scan, ray_table
 from imagine.sim.workers import Workers
 
 
-class TeamMaps:
-    """Evidence, belief and coverage of a batch of worlds on grids of `rows` by `columns` cells.
+class MapArrays(NamedTuple):
+    """The maps of all worlds, as kernels take them.
 
     `layers` int8 `[worlds, drones, sources, rows, columns]` is what a drone holds of each source, `versions` uint32
-    the version of each tile; `belief` int8, `distance` float32 and `states` uint8 are derived. `seen` bool
-    `[worlds, rows, columns]` is what the team has ever known, `discovered` counts the cells each drone saw first.
+    the version of each tile, `clocks` uint32 the greatest version a drone has given. `marks` int8 is each drone's
+    newest scan drawn in whole tiles, `corners` int64 the grid row and column of their first cell, `changed` int64 how
+    many cells of its own layer it changed. `belief` int8, `states`, `kinds` and `cost` (padded planning grids, see
+    `imagine.core.frontier`) are derived; `dirty` uint8 tells the tiles of a drone whose layers changed since.
+    `seen` bool `[worlds, rows, columns]` is what the team has ever known, `discovered` counts the cells each drone saw
+    first. `origins` int64 are the grid's first column and row in map cells.
     """
 
-    def __init__(self, worlds: int, drones: int, rows: int, columns: int, workers: Workers | None = None) -> None:
-        """Make empty maps; rows and columns are whole tiles."""
-        self._workers = workers or Workers()
+    layers: NDArray[np.int8]
+    versions: NDArray[np.uint32]
+    clocks: NDArray[np.uint32]
+    marks: NDArray[np.int8]
+    corners: NDArray[np.int64]
+    changed: NDArray[np.int64]
+    belief: NDArray[np.int8]
+    states: NDArray[np.uint8]
+    kinds: NDArray[np.uint8]
+    cost: NDArray[np.int16]
+    dirty: NDArray[np.uint8]
+    seen: NDArray[np.bool_]
+    coverable: NDArray[np.bool_]
+    discovered: NDArray[np.int64]
+    gained: NDArray[np.int64]
+    origins: NDArray[np.int64]
+
+
+class Pens(NamedTuple):
+    """How scans are drawn: the beams' directions, the ray table, and (least range, range cap) in metres."""
+
+    directions: NDArray[np.float64]
+    starts: NDArray[np.int32]
+    offsets: NDArray[np.int16]
+    range_min: float
+    range_cap: float
+
+
+class Scratch(NamedTuple):
+    """What one thread works with while it brings frontier fields up to date."""
+
+    dirty: NDArray[np.int32]
+    is_dirty: NDArray[np.uint8]
+    heads: NDArray[np.int32]
+    entry_cell: NDArray[np.int32]
+    entry_next: NDArray[np.int32]
+    boxes: NDArray[np.int64]
+    kept: NDArray[np.float32]
+
+
+class TeamMaps:
+    """Evidence, belief, frontier fields and coverage of a batch of worlds on grids of `rows` by `columns` cells."""
+
+    def __init__(
+        self, worlds: int, drones: int, rows: int, columns: int, lidar: LidarSpec, range_cap_m: float, workers: Workers
+    ) -> None:
+        """Make empty maps; rows and columns are whole tiles, scans are mapped up to `range_cap_m`."""
+        self._workers = workers
+        table = ray_table(range_cap_m)
         tiles = rows // TILE, columns // TILE
-        self.layers = np.zeros((worlds, drones, drones, rows, columns), np.int8)
-        self.versions = np.zeros((worlds, drones, drones, *tiles), np.uint32)
-        self.clocks = np.zeros((worlds, drones), np.uint32)
-        self.belief = np.zeros((worlds, drones, rows, columns), np.int8)
-        self.distance = np.full((worlds, drones, rows // 2, columns // 2), np.inf, np.float32)
-        self.states = np.zeros((worlds, drones, rows // 2, columns // 2), np.uint8)
-        self.seen = np.zeros((worlds, rows, columns), np.bool_)
-        self.coverable = np.zeros((worlds, rows, columns), np.bool_)
+        padded = rows // 2 + 2 * PAD, columns // 2 + 2 * PAD
+        self.pens = Pens(
+            beam_directions(lidar.start, lidar.increment, lidar.beams),
+            table.starts, table.offsets, lidar.range_min, range_cap_m,
+        )  # fmt: skip
+        self.arrays = MapArrays(
+            layers=np.zeros((worlds, drones, drones, rows, columns), np.int8),
+            versions=np.zeros((worlds, drones, drones, *tiles), np.uint32),
+            clocks=np.zeros((worlds, drones), np.uint32),
+            marks=np.zeros((worlds, drones, table.side, table.side), np.int8),
+            corners=np.zeros((worlds, drones, 2), np.int64),
+            changed=np.zeros((worlds, drones), np.int64),
+            belief=np.zeros((worlds, drones, rows, columns), np.int8),
+            states=np.zeros((worlds, drones, *padded), np.uint8),
+            kinds=np.zeros((worlds, drones, *padded), np.uint8),
+            cost=np.full((worlds, drones, *padded), BLOCKED, np.int16),
+            dirty=np.zeros((worlds, drones, *tiles), np.uint8),
+            seen=np.zeros((worlds, rows, columns), np.bool_),
+            coverable=np.zeros((worlds, rows, columns), np.bool_),
+            discovered=np.zeros((worlds, drones), np.int64),
+            gained=np.zeros((worlds, drones), np.int64),
+            origins=np.zeros((worlds, 2), np.int64),
+        )
         self.coverable_cells = np.ones(worlds, np.int64)
-        self.discovered = np.zeros((worlds, drones), np.int64)
-        self.tiles_sent = np.zeros((worlds, drones), np.int64)
-        self.origins = np.zeros((worlds, 2), np.int64)
-        self.extents = np.zeros((worlds, 2), np.int64)
+        cells = padded[0] * padded[1]
+        self.scratch = [
+            Scratch(
+                np.empty(cells, np.int32), np.zeros(cells, np.uint8), *search_scratch(cells),
+                np.empty((tiles[0] * tiles[1], 4), np.int64), np.empty(lidar.beams, np.float32),
+            )
+            for _ in range(workers.threads)
+        ]  # fmt: skip
 
     def clear(self, world: int, coverable: NDArray[np.bool_], origin_cells: tuple[int, int]) -> None:
         """Forget everything of a world and give it the cells that can be covered, on its level's own grid."""
-        for array in (self.layers, self.versions, self.clocks, self.belief, self.states, self.seen, self.coverable):
+        arrays = self.arrays
+        for array in (
+            arrays.layers, arrays.versions, arrays.clocks, arrays.belief, arrays.states, arrays.kinds, arrays.dirty,
+            arrays.seen, arrays.coverable, arrays.discovered, arrays.gained, arrays.changed,
+        ):  # fmt: skip
             array[world] = 0
-        self.distance[world] = np.inf
-        self.discovered[world] = 0
-        self.tiles_sent[world] = 0
-        self.coverable[world, : coverable.shape[0], : coverable.shape[1]] = coverable
+        arrays.cost[world] = BLOCKED
+        arrays.coverable[world, : coverable.shape[0], : coverable.shape[1]] = coverable
         self.coverable_cells[world] = max(1, int(coverable.sum()))
-        self.origins[world] = origin_cells
-        self.extents[world] = coverable.shape
-
-    def update(
-        self,
-        ranges: NDArray[np.float32],
-        poses: NDArray[np.float64],
-        lidar: tuple[float, float, float, float],
-        connected: NDArray[np.bool_],
-        relays: bool,
-        tiles_a_tick: int,
-        active: NDArray[np.bool_] | None = None,
-    ) -> NDArray[np.int64]:
-        """Integrate every drone's scan, exchange tiles over the links, and bring beliefs and fields up to date.
-
-        `ranges` `[worlds, drones, beams]`, `poses` `[worlds, drones, 3]`, `lidar` (start, increment, range_min,
-        range cap), `connected` bool `[worlds, drones, drones]`; worlds not `active`
-        (`[worlds]`) are left alone. Returns the newly seen coverable cells per drone,
-        `[worlds, drones]`.
-        """
-        gained = np.zeros(self.discovered.shape, np.int64)
-        if active is None:
-            active = np.ones(len(gained), np.bool_)
-        self._workers.over(
-            len(gained), _update, self.layers, self.versions, self.clocks, self.belief, self.distance, self.states,
-            self.seen, self.coverable, self.origins, self.extents, self.tiles_sent, gained, ranges, poses, lidar,
-            connected, relays, tiles_a_tick, active,
-        )  # fmt: skip
-        self.discovered += gained
-        return gained
+        arrays.origins[world] = origin_cells
 
     def coverage(self) -> NDArray[np.float64]:
         """Return the share of the coverable cells that the team has seen, `[worlds]`."""
-        share: NDArray[np.float64] = self.discovered.sum(axis=1) / self.coverable_cells
+        share: NDArray[np.float64] = self.arrays.discovered.sum(axis=1) / self.coverable_cells
         return share
 
 
 @numba.njit(cache=True, nogil=True)
-def _update(  # type: ignore[no-untyped-def]
-    first, last, layers, versions, clocks, belief, distance, states, seen, coverable, origins, extents, tiles_sent,
-    gained, ranges, poses, lidar, connected, relays, tiles_a_tick, active,
-):  # fmt: skip
-    drones = clocks.shape[1]
-    for world in range(first, last):
-        if not active[world]:
+def integrate_scans(world, maps, pens, ranges, poses, connected, active, kept):  # type: ignore[no-untyped-def]
+    """Add the scans of one world's `active` drones to their own layers; count what nobody had seen before.
+
+    `ranges` float32 `[drones, beams]`, `poses` `[drones, 3]`, `connected` bool `[drones, drones]`: a drone leaves out
+    its returns on teammates it hears. `kept` is scratch for one scan.
+    """
+    drones = maps.clocks.shape[1]
+    column0, row0 = maps.origins[world, 0], maps.origins[world, 1]
+    for drone in range(drones):
+        maps.gained[world, drone] = 0
+        maps.changed[world, drone] = 0
+        if not active[drone]:
             continue
-        column0, row0 = origins[world]
-        for drone in range(drones):
-            _integrate_own(
-                layers[world, drone, drone], versions[world, drone, drone], clocks[world], drone, column0, row0,
-                ranges[world, drone], poses[world], lidar, connected[world, drone],
-            )  # fmt: skip
-            gained[world, drone] = _count_new(
-                layers[world, drone, drone], seen[world], coverable[world], column0, row0, poses[world, drone], lidar[3]
-            )
-        _exchange(layers[world], versions[world], connected[world], relays, tiles_a_tick, tiles_sent[world])
-        for drone in range(drones):
-            rows, columns = extents[world]  # beyond the level's own grid everything stays unknown
-            sum_layers(layers[world, drone, :, :rows, :columns], belief[world, drone, :rows, :columns])
-            inner_states = states[world, drone, : rows // 2, : columns // 2]
-            plan_states(belief[world, drone, :rows, :columns], inner_states)
-            frontier_distances(inner_states, distance[world, drone, : rows // 2, : columns // 2])
+        x, y, yaw = poses[drone, 0], poses[drone, 1], poses[drone, 2]
+        _without_teammates(kept, ranges[drone], pens.directions, poses, drone, connected[drone], pens.range_cap)
+        marks = maps.marks[world, drone]
+        row, column = mark_scan(
+            marks, x, y, yaw, pens.directions, kept, pens.range_min, pens.range_cap, pens.starts, pens.offsets
+        )
+        maps.corners[world, drone, 0], maps.corners[world, drone, 1] = row - row0, column - column0
+        cells, dirty, versions = maps.layers[world, drone, drone], maps.dirty[world, drone], maps.versions[world, drone]
+        touched = np.zeros(dirty.shape, np.bool_)
+        changed = apply_marks(cells, marks, row - row0, column - column0, touched)
+        maps.changed[world, drone] = changed
+        if changed == 0:
+            continue
+        maps.clocks[world, drone] += np.uint32(1)
+        for i in range(dirty.shape[0]):
+            for j in range(dirty.shape[1]):
+                if touched[i, j]:
+                    versions[drone, i, j] = maps.clocks[world, drone]
+                    dirty[i, j] = 1
+                    maps.gained[world, drone] += _see(cells, maps.seen[world], maps.coverable[world], i, j)
+        maps.discovered[world, drone] += maps.gained[world, drone]
 
 
 @numba.njit(cache=True, nogil=True)
-def _integrate_own(  # type: ignore[no-untyped-def]
-    cells, versions, clocks, drone, column0, row0, ranges, poses, lidar, connected
-):
-    """Add a drone's scan to its own layer, returns on teammates it hears left out, and advance the touched tiles."""
-    start, increment, range_min, range_cap = lidar
-    x, y, yaw = poses[drone]
-    kept = ranges.copy()
+def _without_teammates(kept, ranges, directions, poses, drone, connected, range_cap):  # type: ignore[no-untyped-def]
+    """Copy a scan with its returns on teammates the drone hears made invalid (nan)."""
+    for beam in range(len(ranges)):
+        kept[beam] = ranges[beam]
+    x, y, yaw = poses[drone, 0], poses[drone, 1], poses[drone, 2]
     for other in range(len(poses)):
         if other == drone or not connected[other]:
             continue
         dx, dy = poses[other, 0] - x, poses[other, 1] - y
         if dx * dx + dy * dy > (range_cap + TEAMMATE_RADIUS_M) ** 2:
             continue
+        c, s = math.cos(yaw), math.sin(yaw)
+        ahead, left = c * dx + s * dy, -s * dx + c * dy
         for beam in range(len(kept)):
-            r = kept[beam]
+            r = np.float64(kept[beam])
             if r < np.inf:
-                bearing = yaw + start + beam * increment
-                ex, ey = r * math.cos(bearing) - dx, r * math.sin(bearing) - dy
+                ex, ey = r * directions[beam, 0] - ahead, r * directions[beam, 1] - left
                 if ex * ex + ey * ey < TEAMMATE_RADIUS_M * TEAMMATE_RADIUS_M:
                     kept[beam] = np.nan
-    touched = np.zeros(versions.shape, np.bool_)
-    changed = integrate_scan(cells, touched, column0, row0, x, y, yaw, start, increment, kept, range_min, range_cap)
-    if changed > 0:
-        clocks[drone] += 1
-        for i in range(versions.shape[0]):
-            for j in range(versions.shape[1]):
-                if touched[i, j]:
-                    versions[i, j] = clocks[drone]
 
 
 @numba.njit(cache=True, nogil=True)
-def _count_new(cells, seen, coverable, column0, row0, pose, range_cap):  # type: ignore[no-untyped-def]
-    """Mark what a drone knows around it as seen; return how many coverable cells nobody had seen before."""
-    rows, columns = cells.shape
-    reach = math.ceil(range_cap / CELL) + 1
-    column = math.floor(pose[0] / CELL) - column0
-    row = math.floor(pose[1] / CELL) - row0
+def _see(cells, seen, coverable, tile_row, tile_column):  # type: ignore[no-untyped-def]
+    """Mark what is known in a tile as seen; return how many coverable cells nobody had seen before."""
     fresh = 0
-    for i in range(max(0, row - reach), min(rows, row + reach + 1)):
-        for j in range(max(0, column - reach), min(columns, column + reach + 1)):
-            if cells[i, j] != 0 and not seen[i, j]:
-                seen[i, j] = True
-                if coverable[i, j]:
-                    fresh += 1
+    for i in range(TILE):
+        line, seen_line = cells[tile_row * TILE + i], seen[tile_row * TILE + i]
+        coverable_line = coverable[tile_row * TILE + i]
+        count = np.int8(0)
+        for j in range(TILE):  # without branches: compiles to vector instructions
+            k = np.uint64(tile_column * TILE + j)
+            known = line[k] != 0
+            count = np.int8(count + np.int8(known & coverable_line[k] & (not seen_line[k])))
+            seen_line[k] = seen_line[k] | known
+        fresh += count
     return fresh
 
 
 @numba.njit(cache=True, nogil=True)
-def _exchange(layers, versions, connected, relays, tiles_a_tick, tiles_sent):  # type: ignore[no-untyped-def]
-    """Copy newer tiles along the links of one world, each sender within its budget for the tick.
+def derive(world, maps, scratch):  # type: ignore[no-untyped-def]
+    """Bring belief and frontier field of one world's drones up to date where their layers changed."""
+    drones, tile_rows, tile_columns = maps.dirty.shape[1:]
+    for drone in range(drones):
+        dirty, belief, states = maps.dirty[world, drone], maps.belief[world, drone], maps.states[world, drone]
+        boxes = 0
+        for i in range(tile_rows):
+            for j in range(tile_columns):
+                if dirty[i, j]:
+                    dirty[i, j] = 0
+                    _sum_tile(maps.layers[world, drone], belief, i, j)
+                    box = refresh_states(belief, states, i, j)
+                    if box[0] <= box[1]:
+                        for k in range(4):
+                            scratch.boxes[boxes, k] = box[k]
+                        boxes += 1
+        if boxes == 0:
+            continue
+        kinds, cost = maps.kinds[world, drone], maps.cost[world, drone]
+        count = 0
+        for k in range(boxes):
+            box = (scratch.boxes[k, 0], scratch.boxes[k, 1], scratch.boxes[k, 2], scratch.boxes[k, 3])
+            count = refresh_kinds(states, kinds, cost, box, scratch.dirty, count, scratch.is_dirty)
+        if count > 0:
+            update_costs(
+                cost, kinds, scratch.dirty, count, scratch.is_dirty,
+                (scratch.heads, scratch.entry_cell, scratch.entry_next),
+            )  # fmt: skip
 
-    One broadcast serves every neighbour that lacks the tile. A sender offers its own layer and, when it relays, what
-    it holds of others. A tile that a drone first gets in this tick is passed on in the next.
-    """
-    drones = len(connected)
-    before = versions.copy()
-    for sender in range(drones):
-        budget = tiles_a_tick
-        for source in range(drones):
-            if source != sender and not relays:
-                continue
-            for i in range(versions.shape[2]):
-                for j in range(versions.shape[3]):
-                    if before[sender, source, i, j] == 0:
-                        continue
-                    version = versions[sender, source, i, j]
-                    wanted = False
-                    for receiver in range(drones):
-                        if (
-                            receiver != sender
-                            and receiver != source
-                            and connected[sender, receiver]
-                            and versions[receiver, source, i, j] < version
-                        ):
-                            wanted = True
-                    if not wanted or budget <= 0:
-                        continue
-                    budget -= 1
-                    tiles_sent[sender] += 1
-                    for receiver in range(drones):
-                        if (
-                            receiver != sender
-                            and receiver != source
-                            and connected[sender, receiver]
-                            and versions[receiver, source, i, j] < version
-                        ):
-                            versions[receiver, source, i, j] = version
-                            for row in range(i * TILE, (i + 1) * TILE):
-                                for column in range(j * TILE, (j + 1) * TILE):
-                                    layers[receiver, source, row, column] = layers[sender, source, row, column]
+
+@numba.njit(cache=True, nogil=True)
+def _sum_tile(layers, belief, tile_row, tile_column):  # type: ignore[no-untyped-def]
+    """Write the clamped sum over sources of a tile of `layers` (int8 `[sources, rows, columns]`) into `belief`."""
+    sources, rows, columns = layers.shape
+    side = columns // (columns // TILE)  # TILE, but unknown to the compiler, which would unroll and not vectorise
+    flat, out = layers.ravel(), belief.ravel()
+    total = np.empty(TILE, np.int16)
+    for i in range(tile_row * side, (tile_row + 1) * side):
+        at = i * columns + tile_column * side
+        second, third = at + rows * columns, at + 2 * rows * columns
+        if sources == 3:
+            for j in range(side):
+                total[np.uint64(j)] = np.int16(
+                    flat[np.uint64(at + j)] + flat[np.uint64(second + j)] + flat[np.uint64(third + j)]
+                )
+        else:
+            for j in range(side):
+                total[np.uint64(j)] = np.int16(flat[np.uint64(at + j)])
+            for source in range(1, sources):
+                other = at + source * rows * columns
+                for j in range(side):
+                    total[np.uint64(j)] = np.int16(total[np.uint64(j)] + flat[np.uint64(other + j)])
+        for j in range(side):
+            value = total[np.uint64(j)]
+            value = value if value < np.int16(LIMIT) else np.int16(LIMIT)
+            out[np.uint64(at + j)] = np.int8(value if value > np.int16(-LIMIT) else np.int16(-LIMIT))
