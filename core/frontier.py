@@ -199,7 +199,7 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
             entry_cell[entries], entry_next[entries], heads[old] = cell, heads[old], entries
             entries += 1
             lowest = min(lowest, old)
-    count = _drop_unsupported(costs, flat_kinds, width, lowest, entries, dirty, count, is_dirty, scratch)
+    count = _drop_unsupported(costs, flat_kinds, np.uint32(width), lowest, entries, dirty, count, is_dirty, scratch)
     entries, lowest = 0, FAR
     for k in range(count):
         cell = np.uint32(dirty[k])
@@ -213,7 +213,7 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
             entry_cell[entries], entry_next[entries], heads[found] = cell, heads[found], entries
             entries += 1
             lowest = min(lowest, found)
-    _settle(costs, flat_kinds, width, lowest, entries, scratch)
+    _settle(costs, flat_kinds, np.uint32(width), lowest, entries, scratch)
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -256,7 +256,8 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
     Cells come by their old cost, so that what may support a cell has been looked at before it.
     """
     heads, entry_cell, entry_next = scratch
-    steps = _steps(width)
+    found, at = np.empty(9, np.uint32), np.empty(9, np.int64)
+    one = np.uint32(1)
     entries = queued
     while queued > 0:
         while heads[level] >= 0:
@@ -270,40 +271,57 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
             if level == 0:
                 if kind & np.uint8(_FRONTIER):
                     continue
-            elif _least(costs, kinds, cell, np.uint32(width)) <= level:
+            elif _least(costs, kinds, cell, width) <= level:
                 continue
             costs[cell] = FAR
             if is_dirty[cell] == 0:
                 is_dirty[cell] = 1
                 dirty[count] = cell
                 count += 1
-            for way in range(8):
-                other = np.uint32(cell + steps[way])
-                c = np.int64(costs[other])
-                step = _STRAIGHT if way < 4 else _DIAGONAL
-                if c < level + step or c == FAR:
-                    continue
-                # corners are not looked at: what did not come this way just proves supported
-                target = level + (step * _NEAR_WALL_COST if (kind | kinds[other]) & np.uint8(_NEAR) else step)
-                if c == target:  # its path may come this way
-                    entry_cell[entries], entry_next[entries], heads[target] = other, heads[target], entries
-                    entries += 1
-                    queued += 1
+            # What may have come this way is looked at next; corners do not matter, it can only prove supported.
+            e, w, n, s = np.uint32(cell + one), np.uint32(cell - one), np.uint32(cell + width), np.uint32(cell - width)
+            ne, nw, se, sw = np.uint32(n + one), np.uint32(n - one), np.uint32(s + one), np.uint32(s - one)
+            ways = np.uint64(0)
+            found[ways], at[ways] = e, _onward(level, kind | kinds[e], _STRAIGHT)
+            ways += np.uint64(at[ways] == costs[e])
+            found[ways], at[ways] = w, _onward(level, kind | kinds[w], _STRAIGHT)
+            ways += np.uint64(at[ways] == costs[w])
+            found[ways], at[ways] = n, _onward(level, kind | kinds[n], _STRAIGHT)
+            ways += np.uint64(at[ways] == costs[n])
+            found[ways], at[ways] = s, _onward(level, kind | kinds[s], _STRAIGHT)
+            ways += np.uint64(at[ways] == costs[s])
+            found[ways], at[ways] = ne, _onward(level, kind | kinds[ne], _DIAGONAL)
+            ways += np.uint64(at[ways] == costs[ne])
+            found[ways], at[ways] = nw, _onward(level, kind | kinds[nw], _DIAGONAL)
+            ways += np.uint64(at[ways] == costs[nw])
+            found[ways], at[ways] = se, _onward(level, kind | kinds[se], _DIAGONAL)
+            ways += np.uint64(at[ways] == costs[se])
+            found[ways], at[ways] = sw, _onward(level, kind | kinds[sw], _DIAGONAL)
+            ways += np.uint64(at[ways] == costs[sw])
+            for k in range(ways):
+                target = at[k]
+                entry_cell[entries], entry_next[entries], heads[target] = found[k], heads[target], entries
+                entries += 1
+                queued += 1
         level += 1
     return count
 
 
-@numba.njit(cache=True, nogil=True)
-def _steps(width):  # type: ignore[no-untyped-def]
-    """Return the ways to the neighbours: east, west, north, south, then between them in the same order of bits."""
-    return np.array([1, -1, width, -width, width + 1, width - 1, -width + 1, -width - 1])
+@numba.njit(cache=True, nogil=True, inline="always")
+def _onward(level, kinds, step):  # type: ignore[no-untyped-def]
+    """Return the cost a step on from a cell of cost `level`; `kinds` are both cells' kinds, or-ed."""
+    return level + (step * _NEAR_WALL_COST if kinds & np.uint8(_NEAR) else step)
 
 
 @numba.njit(cache=True, nogil=True)
 def _settle(costs, kinds, width, level, queued, scratch):  # type: ignore[no-untyped-def]
-    """Carry lowered costs on from the queued cells: Dijkstra's search with a queue for every cost (Dial 1969)."""
+    """Carry lowered costs on from the queued cells: Dijkstra's search with a queue for every cost (Dial 1969).
+
+    The eight ways are written out and gathered without branches, which would be guessed wrong too often.
+    """
     heads, entry_cell, entry_next = scratch
-    steps = _steps(width)
+    found, at = np.empty(9, np.uint32), np.empty(9, np.int64)
+    one = np.uint32(1)
     entries = queued
     while queued > 0:
         while heads[level] >= 0:
@@ -314,22 +332,32 @@ def _settle(costs, kinds, width, level, queued, scratch):  # type: ignore[no-unt
             if costs[cell] != level:
                 continue  # a shorter way was found since
             kind = kinds[cell]
-            for way in range(8):
-                step = _STRAIGHT if way < 4 else _DIAGONAL
-                other = np.uint32(cell + steps[way])
-                if costs[other] <= level + step:  # BLOCKED is below all
-                    continue
-                # a diagonal step cuts no corner: both cells beside it must be free
-                if way > 3 and (
-                    costs[np.uint32(cell + steps[way & 1])] < 0 or costs[np.uint32(cell + steps[2 + (way >> 1 & 1)])] < 0
-                ):
-                    continue
-                reached = level + (step * _NEAR_WALL_COST if (kind | kinds[other]) & np.uint8(_NEAR) else step)
-                if reached < costs[other]:
-                    costs[other] = reached
-                    entry_cell[entries], entry_next[entries], heads[reached] = other, heads[reached], entries
-                    entries += 1
-                    queued += 1
+            e, w, n, s = np.uint32(cell + one), np.uint32(cell - one), np.uint32(cell + width), np.uint32(cell - width)
+            ne, nw, se, sw = np.uint32(n + one), np.uint32(n - one), np.uint32(s + one), np.uint32(s - one)
+            ways = np.uint64(0)
+            # BLOCKED is below all; a diagonal step cuts no corner: both cells beside it must be free
+            found[ways], at[ways] = e, _onward(level, kind | kinds[e], _STRAIGHT)
+            ways += np.uint64(at[ways] < costs[e])
+            found[ways], at[ways] = w, _onward(level, kind | kinds[w], _STRAIGHT)
+            ways += np.uint64(at[ways] < costs[w])
+            found[ways], at[ways] = n, _onward(level, kind | kinds[n], _STRAIGHT)
+            ways += np.uint64(at[ways] < costs[n])
+            found[ways], at[ways] = s, _onward(level, kind | kinds[s], _STRAIGHT)
+            ways += np.uint64(at[ways] < costs[s])
+            found[ways], at[ways] = ne, _onward(level, kind | kinds[ne], _DIAGONAL)
+            ways += np.uint64((at[ways] < costs[ne]) & (costs[n] >= 0) & (costs[e] >= 0))
+            found[ways], at[ways] = nw, _onward(level, kind | kinds[nw], _DIAGONAL)
+            ways += np.uint64((at[ways] < costs[nw]) & (costs[n] >= 0) & (costs[w] >= 0))
+            found[ways], at[ways] = se, _onward(level, kind | kinds[se], _DIAGONAL)
+            ways += np.uint64((at[ways] < costs[se]) & (costs[s] >= 0) & (costs[e] >= 0))
+            found[ways], at[ways] = sw, _onward(level, kind | kinds[sw], _DIAGONAL)
+            ways += np.uint64((at[ways] < costs[sw]) & (costs[s] >= 0) & (costs[w] >= 0))
+            for k in range(ways):
+                other, reached = found[k], at[k]
+                costs[other] = reached
+                entry_cell[entries], entry_next[entries], heads[reached] = other, heads[reached], entries
+                entries += 1
+                queued += 1
         level += 1
 
 
