@@ -59,9 +59,7 @@ class Worlds:
         self.ranges = self.twin.scan()
         beams = (lidar.start, lidar.increment, lidar.range_min, CAP_M)
         self.maps.update(self.ranges, self.twin.poses, beams, np.zeros_like(self.links()), False, 20)
-        self.state.sense(
-            self.twin.poses, self.links(), self.maps.origins, self.alive, self.everywhere, self.twin.dt
-        )
+        self.state.sense(self.twin.poses, self.links(), self.maps.origins, self.alive, self.everywhere, self.twin.dt)
 
     def observe(self) -> dict[str, NDArray[np.float32]]:
         spec, lidar = self.spec, self.twin.lidar
