@@ -46,13 +46,18 @@ def count_peer_visits(visits, column0, row0, positions, ages):  # type: ignore[n
 
 
 @numba.njit(cache=True, nogil=True)
-def _most_visited(visits, row, column, block):  # type: ignore[no-untyped-def]
-    """Return the greatest count in a block of planning cells, 0 outside the grid."""
-    most = np.uint16(0)
-    for i in range(max(0, row), min(visits.shape[0], row + block)):
-        for j in range(max(0, column), min(visits.shape[1], column + block)):
-            most = max(most, visits[i, j])
-    return most
+def _fill_channel(channel, visits, cell_rows, cell_columns, block, levels):  # type: ignore[no-untyped-def]
+    """Fill one view with how bright the most visited of each pixel's block of planning cells looks, 0 outside."""
+    rows, columns = visits.shape
+    brightest = np.uint16(len(levels) - 1)
+    for i in range(channel.shape[0]):
+        for j in range(channel.shape[1]):
+            row, column = cell_rows[i, j], cell_columns[i, j]
+            most = np.uint16(0)
+            for r in range(max(0, row), min(rows, row + block)):
+                for c in range(max(0, column), min(columns, column + block)):
+                    most = max(most, visits[r, c])
+            channel[i, j] = levels[min(most, brightest)]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -64,21 +69,21 @@ def fill_visits(channels, own, peers, team, column0, row0, x, y, turn, scales, l
     """
     n = channels.shape[1]
     cos_turn, sin_turn = math.cos(turn), math.sin(turn)
-    longest = len(levels) - 1
     each = 2 if team else 1
+    cell_rows, cell_columns = np.empty((n, n), np.int64), np.empty((n, n), np.int64)
     for k in range(len(scales)):
         scale = scales[k]
         block = round(scale / CELL)
-        plan_block = max(1, block // 2)
         for i in range(n):
             v = (i + 0.5 - 0.5 * n) * scale
             for j in range(n):
                 u = (j + 0.5 - 0.5 * n) * scale
-                column = (math.floor((x + cos_turn * u - sin_turn * v) / scale) * block - column0) >> 1
-                row = (math.floor((y + sin_turn * u + cos_turn * v) / scale) * block - row0) >> 1
-                channels[each * k, i, j] = levels[min(_most_visited(own, row, column, plan_block), longest)]
-                if team:
-                    channels[2 * k + 1, i, j] = levels[min(_most_visited(peers, row, column, plan_block), longest)]
+                cell_columns[i, j] = (math.floor((x + cos_turn * u - sin_turn * v) / scale) * block - column0) >> 1
+                cell_rows[i, j] = (math.floor((y + sin_turn * u + cos_turn * v) / scale) * block - row0) >> 1
+        plan_block = max(1, block // 2)
+        _fill_channel(channels[each * k], own, cell_rows, cell_columns, plan_block, levels)
+        if team:
+            _fill_channel(channels[2 * k + 1], peers, cell_rows, cell_columns, plan_block, levels)
 
 
 def visit_levels(full_ticks: int) -> NDArray[np.float32]:
