@@ -74,12 +74,20 @@ def fill_visits(channels, own, peers, team, column0, row0, x, y, turn, scales, l
     for k in range(len(scales)):
         scale = scales[k]
         block = round(scale / CELL)
-        for i in range(n):
-            v = (i + 0.5 - 0.5 * n) * scale
-            for j in range(n):
-                u = (j + 0.5 - 0.5 * n) * scale
-                cell_columns[i, j] = (math.floor((x + cos_turn * u - sin_turn * v) / scale) * block - column0) >> 1
-                cell_rows[i, j] = (math.floor((y + sin_turn * u + cos_turn * v) / scale) * block - row0) >> 1
+        if turn == 0.0:
+            column = (math.floor(x / scale + 0.5) - n // 2) * block - column0
+            row = (math.floor(y / scale + 0.5) - n // 2) * block - row0
+            for i in range(n):
+                for j in range(n):
+                    cell_columns[i, j], cell_rows[i, j] = (column + j * block) >> 1, (row + i * block) >> 1
+        else:
+            for i in range(n):
+                v = (i + 0.5 - 0.5 * n) * scale
+                for j in range(n):
+                    u = (j + 0.5 - 0.5 * n) * scale
+                    across, along = x + cos_turn * u - sin_turn * v, y + sin_turn * u + cos_turn * v
+                    cell_columns[i, j] = (math.floor(across / scale) * block - column0) >> 1
+                    cell_rows[i, j] = (math.floor(along / scale) * block - row0) >> 1
         plan_block = max(1, block // 2)
         _fill_channel(channels[each * k], own, cell_rows, cell_columns, plan_block, levels)
         if team:
