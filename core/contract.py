@@ -25,18 +25,34 @@ CONTRACT_KEY = "imagine.contract"
 class ActionSpec(Settings):
     """What the model's output means: numbers in [-1, 1], scaled by the limits.
 
-    `plane`: (vx, vy) along the observation's axes, no rotation. `body`: (vx forward, vy left, yaw rate). Scaling of
-    plane velocity keeps its direction: vectors longer than 1 are shortened to 1.
+    `plane`: (vx, vy) along the observation's axes, no rotation; vectors longer than 1 are shortened to 1, so that the
+    direction is kept. `body`: (vx forward, vy left, yaw rate). `forward`: (speed forward, yaw rate), where a negative
+    speed is none, so that standing and turning on the spot is a whole half of the range and not a single number.
+    `waypoint`: a point to fly to, `waypoint_range_m` times the vector (shortened as in `plane`) from where the drone
+    is, along the observation's axes, without rotation, at a speed from which the drone can stop there.
+
+    A decision stands for `decision_ticks` ticks; a waypoint then stays where it is in the map.
     """
 
-    mode: Literal["plane", "body"] = "plane"
+    mode: Literal["plane", "body", "forward", "waypoint"] = "plane"
     speed_mps: float = Field(default=0.8, gt=0.0)
     yaw_rate_rps: float = Field(default=3.0, gt=0.0)
+    waypoint_range_m: float = Field(default=2.0, gt=0.0, le=20.0, description="distance of the farthest waypoint")
+    waypoint_braking_mps2: float = Field(default=1.0, gt=0.0, description="deceleration it is approached with")
+    waypoint_response_s: float = Field(
+        default=0.4, gt=0.0, le=5.0, description="from setpoint to velocity, reaction included; also the last approach"
+    )
+    decision_ticks: int = Field(default=1, ge=1, le=100, description="ticks of the LiDAR that a decision stands for")
 
     @property
     def size(self) -> int:
         """Numbers in an action."""
-        return 2 if self.mode == "plane" else 3
+        return 3 if self.mode == "body" else 2
+
+    @property
+    def turns(self) -> bool:
+        """Whether the model commands a yaw rate."""
+        return self.mode in ("body", "forward")
 
 
 class LidarContract(Settings):

@@ -8,11 +8,17 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine.core.errors import InputError
 from imagine.core.frames import Pose
 from imagine.core.frontier import FAR, PAD, UNIT_M, FrontierField, cost_at
 from imagine.core.lidar import LidarSpec, Scan
 from imagine.core.observation_spec import ObservationSpec
+from imagine.core.peer_poses import PeerPoses, fill_peer_distances
 from imagine.core.raster import CELL, LIMIT
+from imagine.core.visits import VisitMap, fill_visits, visit_levels
+
+MOTION = 3
+"""Numbers of `motion` that every specification has: velocity along two axes, and yaw rate."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -217,6 +223,30 @@ def fill_motion(motion, vx, vy, yaw_rate, turn, speed, fastest_yaw):  # type: ig
     motion[2] = min(max(yaw_rate / fastest_yaw, -2.0), 2.0)
 
 
+@numba.njit(cache=True, nogil=True)
+def fill_options(numbers, x, y, yaw, positions, ages, options):  # type: ignore[no-untyped-def]
+    """Fill `numbers` (float32, `motion` beyond its first three) with what `options`, by `option_parameters`, ask for.
+
+    `positions` and `ages` of the peers as in `PeerPoses`.
+    """
+    position, extent, heading, peers, range_m = options
+    at = 0
+    if position:
+        numbers[0] = min(max(x / extent, -2.0), 2.0)
+        numbers[1] = min(max(y / extent, -2.0), 2.0)
+        at = 2
+    if heading:
+        numbers[at], numbers[at + 1] = math.cos(yaw), math.sin(yaw)
+        at += 2
+    if peers > 0:
+        fill_peer_distances(numbers[at : at + peers], x, y, positions, ages, range_m)
+
+
+def option_parameters(spec: ObservationSpec) -> tuple[bool, float, bool, int, float]:
+    """Return what `fill_options` needs to know of a specification, as plain numbers."""
+    return spec.position, spec.position_extent_m, spec.heading, spec.peers, spec.peers_range_m
+
+
 def observe(
     spec: ObservationSpec,
     belief: NDArray[np.int8],
@@ -227,21 +257,40 @@ def observe(
     yaw_rate: float,
     scan: Scan,
     lidar: LidarSpec,
+    peers: PeerPoses | None = None,
+    visits: VisitMap | None = None,
 ) -> dict[str, NDArray[np.float32]]:
     """Return what a policy sees, arrays named and shaped as `spec.shapes`.
 
     `belief` int8 `[rows, columns]` with its first cell at `origin_cells` (column, row); `velocity` m/s in the map
-    frame; `yaw_rate` rad/s.
+    frame; `yaw_rate` rad/s; `peers` None: nobody is known. Raises InputError where the spec shows visits and none are
+    given, or where they lie on another grid than the belief.
     """
     observation = {name: np.empty(shape, np.float32) for name, shape in spec.shapes.items()}
     turn = pose.yaw if spec.axes == "heading" else 0.0
+    scales = np.array(spec.view_scales_m)
+    maps = 2 * len(scales)
     fill_views(
-        observation["views"], belief, field.cost, origin_cells[0], origin_cells[1], pose.x, pose.y, turn,
-        np.array(spec.view_scales_m), np.array(spec.frontier_ranges_m),
+        observation["views"][:maps], belief, field.cost, origin_cells[0], origin_cells[1], pose.x, pose.y, turn,
+        scales, np.array(spec.frontier_ranges_m),
     )  # fmt: skip
+    if spec.visits != "off":
+        rows, columns = belief.shape
+        if visits is None or visits.origin_cells != origin_cells or visits.own.shape != (rows // 2, columns // 2):
+            raise InputError("the observation shows visits: give a visit map that is fitted to the belief's grid")
+        fill_visits(
+            observation["views"][maps:], visits.own, visits.peers, spec.visits == "team",
+            origin_cells[0], origin_cells[1], pose.x, pose.y, turn, scales, visit_levels(spec.visits_full_ticks),
+        )  # fmt: skip
     fill_sectors(
         observation["lidar"], scan.ranges, lidar.range_min, lidar.start, lidar.increment,
         pose.yaw - turn, spec.lidar_range_m,
     )  # fmt: skip
     fill_motion(observation["motion"], velocity[0], velocity[1], yaw_rate, turn, spec.speed_mps, spec.yaw_rate_rps)
+    if len(observation["motion"]) > MOTION:
+        known = peers or PeerPoses.none()
+        fill_options(
+            observation["motion"][MOTION:], pose.x, pose.y, pose.yaw, known.positions, known.ages_s,
+            option_parameters(spec),
+        )  # fmt: skip
     return observation

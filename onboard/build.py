@@ -12,8 +12,10 @@ from imagine.core.frontier import frontier_field, own_distance
 from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec, Scan, mask_near
 from imagine.core.observation import observe
 from imagine.core.observation_spec import ObservationSpec
+from imagine.core.peer_poses import PeerPoses
 from imagine.core.planner import plan_velocity
 from imagine.core.shield import shield_velocity
+from imagine.core.visits import VisitMap
 from imagine.mesh_comm.keys import default_boot_file, find_key, next_boot_number
 from imagine.mesh_comm.node import MeshNode
 from imagine.mesh_comm.seal import KEY_BYTES, Sealer
@@ -88,7 +90,10 @@ def _rehearse_flight(settings: DroneSettings, policy: Policy | None, scan: Scan,
     mask_near(scan.ranges, lidar, pose, np.zeros((1, 2)), TEAMMATE_RADIUS_M)
     if policy is not None:
         spec = policy.contract.observation
-    observation = observe(spec, belief, field, origin, pose, (0.0, 0.0), 0.0, scan, lidar)
+    mates, visits = PeerPoses(np.zeros((1, 2)), np.zeros(1)), VisitMap()
+    visits.fit(origin, evidence.shape)
+    visits.count(pose.x, pose.y, mates)
+    observation = observe(spec, belief, field, origin, pose, (0.0, 0.0), 0.0, scan, lidar, mates, visits)
     if policy is not None:
         policy.infer(observation)
 

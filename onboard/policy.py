@@ -119,8 +119,12 @@ def _misfits(
             yield f"map.{name}", wanted, has
     if contract.action.speed_mps > limits.speed_mps + _TOLERANCE:
         yield "action.speed_mps", contract.action.speed_mps, limits.speed_mps
-    if contract.action.mode == "body" and contract.action.yaw_rate_rps > limits.yaw_rate_rps + _TOLERANCE:
+    if contract.action.turns and contract.action.yaw_rate_rps > limits.yaw_rate_rps + _TOLERANCE:
         yield "action.yaw_rate_rps", contract.action.yaw_rate_rps, limits.yaw_rate_rps
+    if contract.action.mode == "waypoint":  # a drone that cannot brake so hard would fly past its points
+        braking, has = contract.action.waypoint_braking_mps2, limits.acceleration_mps2
+        if braking > has + _TOLERANCE:
+            yield "action.waypoint_braking_mps2", braking, has
     if limits.radius_m > contract.limits.radius_m + _TOLERANCE:  # a wider drone was never trained in these passages
         yield "limits.radius_m", contract.limits.radius_m, limits.radius_m
 

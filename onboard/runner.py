@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.action import to_body_velocity
-from imagine.core.errors import InputError, WorkError
+from imagine.core.errors import InputError
 from imagine.core.evidence import EvidenceMap
 from imagine.core.frames import Pose, rotate
 from imagine.core.frontier import FrontierField, frontier_field, own_distance
@@ -21,6 +20,7 @@ from imagine.core.lidar import Scan, mask_near
 from imagine.core.observation import observe
 from imagine.core.planner import plan_velocity
 from imagine.core.shield import shield_velocity
+from imagine.core.visits import VisitMap
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.node import MeshNode
 from imagine.onboard.flight import Flight, FlightStep
@@ -28,8 +28,10 @@ from imagine.onboard.ladder import STILL, Decider, Decision, Ladder, Order, Situ
 from imagine.onboard.perception import Perception, PerceptionResult
 from imagine.onboard.phases import AIRBORNE, Phase
 from imagine.onboard.policy import Policy
+from imagine.onboard.policy_decisions import PolicyDecisions
 from imagine.onboard.records import Event, OdometryOut, RunnerStatus, Setpoint, Telemetry, TickInput, TickOutput
 from imagine.onboard.settings import DroneSettings
+from imagine.onboard.teammates import peer_poses
 from imagine.onboard.yaw_prior import YawPrior
 
 
@@ -72,10 +74,12 @@ class Runner:
         """Put the parts together; without a policy the frontier planner flies, without mesh the drone is alone."""
         self.settings = settings
         self.lidar = settings.lidar_spec
-        self.policy = policy
+        self.decisions = None if policy is None else PolicyDecisions(policy)
         self.perception = perception
         self.evidence = evidence
         self.mesh = mesh
+        sees_visits = policy is not None and policy.contract.observation.visits != "off"
+        self.visits = VisitMap() if sees_visits else None
         self.ladder = Ladder(settings.ladder, settings.max_flight_s)
         self.flight = Flight(settings.flight)
         self._yaw_prior = YawPrior(settings.limits.yaw_rate_rps)
@@ -149,6 +153,10 @@ class Runner:
                 self._tell(inputs.now, "error", str(error))
             belief = self.evidence.belief()
             new_cells = int(np.count_nonzero(belief) - known)
+        if self.visits is not None:
+            self.visits.fit(self.evidence.origin_cells, self.evidence.shape)
+            if where.ok and self.flight.phase is Phase.EXPLORE:  # as in training, where time begins with exploring
+                self.visits.count(where.pose.x, where.pose.y, peer_poses(self.mesh, inputs.now)[1])
         return Mapped(belief, frontier_field(belief), new_cells)
 
     def _propose(self, where: PerceptionResult | None, mapped: Mapped | None, inputs: TickInput) -> Proposals:
@@ -157,28 +165,23 @@ class Runner:
         if where is None or mapped is None or scan is None:
             return _NOTHING
         pose, origin = where.pose, self.evidence.origin_cells
-        wanted, failure = self._infer(where, mapped, scan)
+        wanted, failure = self._infer(where, mapped, scan, inputs.now)
         planned = plan_velocity(mapped.field, origin, pose, scan, self.lidar, self.settings.limits.speed_mps)
         frontier = None if planned is None else (*rotate(-pose.yaw, *planned), 0.0)
         return Proposals(wanted, failure, frontier, own_distance(mapped.field, origin, pose.x, pose.y))
 
-    def _infer(self, where: PerceptionResult, mapped: Mapped, scan: Scan) -> tuple[Velocity | None, str]:
-        if self.policy is None:
+    def _infer(self, where: PerceptionResult, mapped: Mapped, scan: Scan, now: float) -> tuple[Velocity | None, str]:
+        if self.decisions is None:
             return None, "no policy: the frontier planner flies"
-        contract, pose = self.policy.contract, where.pose
-        observation = observe(
-            contract.observation, mapped.belief, mapped.field, self.evidence.origin_cells,
-            pose, where.velocity, where.yaw_rate, scan, self.lidar,
-        )  # fmt: skip
-        try:
-            action = self.policy.infer(observation)
-        except WorkError as error:
-            return None, str(error)
-        if action.shape != (contract.action.size,):
-            return None, f"the policy's output has shape {action.shape}, expected ({contract.action.size},)"
-        if not np.isfinite(action).all():
-            return None, "the policy's output is not finite"
-        return to_body_velocity(action, contract.action, contract.observation.axes, pose.yaw), ""
+        spec = self.decisions.policy.contract.observation
+
+        def look() -> dict[str, NDArray[np.float32]]:
+            return observe(
+                spec, mapped.belief, mapped.field, self.evidence.origin_cells, where.pose, where.velocity,
+                where.yaw_rate, scan, self.lidar, peer_poses(self.mesh, now)[0], self.visits,
+            )  # fmt: skip
+
+        return self.decisions.next_velocity(look, where.pose, is_flying=self._decider is Decider.POLICY)
 
     def _decide(
         self, where: PerceptionResult | None, mapped: Mapped | None, proposals: Proposals, inputs: TickInput

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from imagine.core.errors import InputError
 from imagine.core.lidar import PRESETS
 from imagine.core.planner import plan_kernel
+from imagine.sim.decision_state import DecisionState
 from imagine.sim.exploration_kernels import fill_critic, fill_observations, shielded_setpoints
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.level import Level, load_level, mirrored
@@ -86,6 +87,10 @@ class Exploration:
         first = [self._draw_level(world) for world in range(self.worlds)]
         self.twin = Twin(first, self.drones, self.lidar, settings.limits, seed)
         self.maps = TeamMaps(self.worlds, self.drones, rows, columns, self.twin.workers)
+        self.decisions = DecisionState(
+            self.worlds, self.drones, rows, columns, settings.observation, settings.action, self.twin.workers
+        )
+        self.alive = np.ones((self.worlds, self.drones), bool)
         self.ticks = np.zeros(self.worlds, np.int64)
         self._idle = np.zeros(self.worlds, np.int64)
         self._limit = np.full(self.worlds, settings.episode_ticks)
@@ -143,10 +148,10 @@ class Exploration:
 
     def _setpoints(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
         setpoints = np.zeros((self.worlds, self.drones, 3))
-        spec, limits, lidar = self.settings.action, self.settings.limits, self.lidar
+        limits, lidar = self.settings.limits, self.lidar
+        self.decisions.decide(actions, self.twin.poses)
         shielded_setpoints(
-            setpoints, actions.astype(np.float64), spec.mode == "body", self.settings.observation.axes == "map",
-            spec.speed_mps, spec.yaw_rate_rps, self.twin.poses, self._ranges,
+            setpoints, self.decisions.intents, self.decisions.parameters, self.twin.poses, self._ranges,
             (lidar.range_min, lidar.start, lidar.increment),
             (limits.radius_m, limits.lag_s, limits.acceleration_mps2),
         )  # fmt: skip

@@ -13,19 +13,15 @@ from imagine.core.shield import shield_kernel
 
 
 @numba.njit(cache=True, nogil=True)
-def shielded_setpoints(  # type: ignore[no-untyped-def]
-    setpoints, actions, body_mode, map_axes, speed, fastest_yaw, poses, ranges, lidar, limits
-):
-    """Turn actions into body velocities and pass them through the shield, both as in flight."""
+def shielded_setpoints(setpoints, intents, parameters, poses, ranges, lidar, limits):  # type: ignore[no-untyped-def]
+    """Turn the decisions that stand into body velocities and pass them through the shield, both as in flight."""
     range_min, start, increment = lidar
     radius, lag, acceleration = limits
-    for world in range(actions.shape[0]):
-        for drone in range(actions.shape[1]):
-            numbers = actions[world, drone]
-            turn = numbers[2] if body_mode else 0.0
-            vx, vy, rate = body_velocity_kernel(
-                numbers[0], numbers[1], turn, body_mode, map_axes, speed, fastest_yaw, poses[world, drone, 2]
-            )
+    for world in range(intents.shape[0]):
+        for drone in range(intents.shape[1]):
+            a, b, c = intents[world, drone]
+            x, y, yaw = poses[world, drone]
+            vx, vy, rate = body_velocity_kernel(a, b, c, parameters, x, y, yaw)
             vx, vy = shield_kernel(vx, vy, ranges[world, drone], range_min, start, increment, radius, lag, acceleration)
             setpoints[world, drone, 0], setpoints[world, drone, 1], setpoints[world, drone, 2] = vx, vy, rate
 

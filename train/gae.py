@@ -12,7 +12,9 @@ def advantages_and_returns(
     """Return (advantages, returns), both `[steps, agents]`, of a rollout.
 
     `rewards`, `values`, `dones` `[steps, agents]`; `dones[t]` tells that the episode ended with step t, so nothing
-    after it counts. `last_values` `[agents]` are the values of the state after the last step.
+    after it counts. A drone that dies is done then; its steps until the world's end, which follow that `done` and end
+    with another, reach no other step and are to be left out. `last_values` `[agents]` are the values of the state
+    after the last step.
     """
     advantages = torch.empty_like(rewards)
     following = torch.zeros_like(last_values)

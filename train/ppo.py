@@ -60,8 +60,13 @@ def update(
     advantages, returns = advantages_and_returns(
         rollout.rewards, values, rollout.dones, last_values, settings.gamma, settings.gae_lambda
     )
-    explained = 1.0 - float((returns - values).var() / (returns.var() + 1e-8))
-    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    lived = rollout.alive.flatten().nonzero().squeeze(1)  # nothing is learned from the steps of the dead
+    if len(lived) < 2:
+        raise WorkError("training needs living drones: all were dead through a whole rollout")
+    errors, targets = (returns - values).flatten()[lived], returns.flatten()[lived]
+    explained = 1.0 - float(errors.var() / (targets.var() + 1e-8))
+    counted = advantages.flatten()[lived]
+    advantages = (advantages - counted.mean()) / (counted.std() + 1e-8)
     flat = {key: value.flatten(0, 1) for key, value in rollout.observations.items()}
     flat_actions, flat_log_probs = rollout.actions.flatten(0, 1), rollout.log_probs.flatten()
     flat_advantages, flat_returns = advantages.flatten(), returns.flatten()
@@ -69,7 +74,7 @@ def update(
     actor_records: list[dict[str, float]] = []
     critic_losses: list[dict[str, float]] = []
     for _ in range(settings.epochs):
-        order = torch.randperm(rollout.agent_steps, generator=generator)
+        order = lived[torch.randperm(len(lived), generator=generator)]
         for batch in torch.split(order, settings.minibatch):
             sample = {key: value[batch] for key, value in flat.items()}
 
@@ -99,7 +104,7 @@ def update(
         **mean_of(actor_records),
         "explained_variance": explained,
         "action_std": actor.log_std.detach().exp().mean().item(),
-        "reward": rollout.rewards.mean().item(),
+        "reward": rollout.rewards.flatten()[lived].mean().item(),
     }
 
 

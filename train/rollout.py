@@ -21,8 +21,9 @@ OBSERVATION_KEYS = ("views", "lidar", "motion")
 class Rollout:
     """Steps of all drones of all worlds; tensors `[steps, agents, ...]`, agents = worlds x drones.
 
-    `last` holds the observation after the last step, `[agents, ...]`; `level` images are the critic's own;
-    `env_s` is the time the environment took.
+    `alive` tells which drones acted: what a dead one is said to have done counts for nothing. `dones[t]` tells that a
+    drone's own episode ended with step t, by its death or with the world's. `last` holds the observation after the last
+    step, `[agents, ...]`; `level` images are the critic's own; `env_s` is the time the environment took.
     """
 
     observations: dict[str, Tensor]
@@ -31,13 +32,14 @@ class Rollout:
     rewards: Tensor
     dones: Tensor
     last: dict[str, Tensor]
+    alive: Tensor
     episodes: list[EpisodeMetrics] = field(default_factory=list)
     env_s: float = 0.0
 
     @property
     def agent_steps(self) -> int:
         """Decisions taken, over all drones."""
-        return self.rewards.numel()
+        return int(self.alive.sum())
 
 
 def agent_tensors(observation: Observation) -> dict[str, Tensor]:
@@ -62,7 +64,7 @@ def collect(
     action_size = actor.log_std.shape[0]
     actions = torch.empty((steps, agents, action_size))
     log_probs, rewards = torch.empty((steps, agents)), torch.empty((steps, agents))
-    dones = torch.empty((steps, agents), dtype=torch.bool)
+    dones, alive = (torch.empty((steps, agents), dtype=torch.bool) for _ in range(2))
     episodes: list[EpisodeMetrics] = []
     env_s = 0.0
     for t in range(steps):
@@ -71,16 +73,18 @@ def collect(
         mean, log_std = actor(*actor_inputs(tensors)), actor.spread()
         actions[t] = mean + log_std.exp() * torch.randn((agents, action_size), generator=generator)
         log_probs[t] = log_probability(actions[t], mean, log_std)
+        alive[t] = torch.from_numpy(env.alive.reshape(-1))
         began = time.perf_counter()
         step = env.step(env_actions(actions[t], env))
         env_s += time.perf_counter() - began
         rewards[t] = torch.from_numpy(step.reward.reshape(-1))
-        dones[t] = torch.from_numpy(np.repeat(step.done, env.drones))
+        died = alive[t] & ~torch.from_numpy(env.alive.reshape(-1))  # a world that starts anew has everyone alive again
+        dones[t] = torch.from_numpy(np.repeat(step.done, env.drones)) | died
         episodes.extend(step.episodes)
         observation = step.observation
         tensors = agent_tensors(observation)
     last = {key: value.clone() for key, value in tensors.items()}
-    return Rollout(kept, actions, log_probs, rewards, dones, last, episodes, env_s), observation
+    return Rollout(kept, actions, log_probs, rewards, dones, last, alive, episodes, env_s), observation
 
 
 def env_actions(actions: Tensor, env: Exploration) -> np.ndarray[Any, np.dtype[np.float32]]:
@@ -92,7 +96,7 @@ def env_actions(actions: Tensor, env: Exploration) -> np.ndarray[Any, np.dtype[n
 def values_of(critic: Critic, rollout: Rollout, minibatch: int) -> tuple[Tensor, Tensor]:
     """Return the critic's values of all steps, `[steps, agents]`, and of the state after the last, `[agents]`."""
     flat = {key: value.flatten(0, 1) for key, value in rollout.observations.items()}
-    count = rollout.agent_steps
+    count = rollout.rewards.numel()
     pieces = [
         critic(*(flat[key][i : i + minibatch] for key in (*OBSERVATION_KEYS, "level")))
         for i in range(0, count, minibatch)

@@ -34,20 +34,34 @@ def contract(**changes: Any) -> PolicyContract:
 
 @given(
     st.text(min_size=1, max_size=100),
-    st.sampled_from(["plane", "body"]),
+    st.sampled_from(["plane", "body", "forward", "waypoint"]),
     st.sampled_from(["map", "heading"]),
     st.integers(1, 720),
     st.floats(0.1, 6.0),
     st.floats(0.1, 5.0),
+    st.integers(0, 15),
+    st.booleans(),
+    st.sampled_from(["off", "self", "team"]),
+    st.integers(1, 100),
     st.dictionaries(st.text(max_size=5), st.one_of(st.integers(), st.booleans(), st.none(), st.text(max_size=5))),
 )
 def test_it_comes_back_the_same(
-    name: str, mode: Any, axes: Any, beams: int, fov: float, speed: float, training: dict[str, Any]
+    name: str,
+    mode: Any,
+    axes: Any,
+    beams: int,
+    fov: float,
+    speed: float,
+    peers: int,
+    position: bool,
+    visits: Any,
+    ticks: int,
+    training: dict[str, Any],
 ) -> None:
     sent = contract(
         name=name,
-        action=ActionSpec(mode=mode, speed_mps=speed),
-        observation=ObservationSpec(axes=axes),
+        action=ActionSpec(mode=mode, speed_mps=speed, decision_ticks=ticks),
+        observation=ObservationSpec(axes=axes, peers=peers, position=position, visits=visits),
         lidar=LidarContract.of(LidarSpec(beams=beams, fov=fov, start=-fov / 2)),
         training=training,
     )
@@ -90,8 +104,10 @@ def changed(path: str, value: Any) -> str:
         ("lidar.beams", ..., "key 'lidar.beams' is missing"),
         ("lidar.beams", "many", r"lidar\.beams"),
         ("observation.version", 9, r"observation\.version"),
+        ("observation.peers", 2, r"observation: version 1 knows no peers"),
         ("observation.view_scale", 1, r"unknown key 'observation\.view_scale'; did you mean 'view_scales_m'"),
         ("action.mode", "jump", r"action\.mode"),
+        ("action.decision_ticks", 0, r"action\.decision_ticks"),
         ("limits.speed_mps", -1, r"limits\.speed_mps"),
         ("map.range_cap_m", None, r"map\.range_cap_m"),
         ("rate_hz", float("nan"), "rate_hz"),
@@ -113,3 +129,12 @@ def test_an_impossible_lidar_is_refused_when_it_is_built(field: tuple[str, Any])
     text = changed(f"lidar.{field[0]}", field[1])
     with pytest.raises(InputError, match=field[0]):
         PolicyContract.from_json(text, "m.onnx").lidar.spec()
+
+
+def test_a_contract_from_before_the_options_reads_as_without_them() -> None:
+    data = json.loads(contract().to_json())
+    for name in ("position", "position_extent_m", "heading", "peers", "peers_range_m", "visits", "visits_full_ticks"):
+        del data["observation"][name]
+    for name in ("waypoint_range_m", "waypoint_braking_mps2", "waypoint_response_s", "decision_ticks"):
+        del data["action"][name]
+    assert PolicyContract.from_json(json.dumps(data), "m.onnx") == contract()

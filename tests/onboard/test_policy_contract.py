@@ -119,6 +119,12 @@ def test_a_model_for_this_drone_fits():
     check_fit(make_contract(), *DRONE, "p.onnx")
 
 
+@pytest.mark.parametrize("mode", ["plane", "waypoint"])
+def test_a_model_that_never_turns_asks_for_no_yaw_rate(mode):
+    slow = VehicleLimits(yaw_rate_rps=0.5)
+    check_fit(make_contract(action=ActionSpec(mode=mode)), LD19, MapSettings(), slow, "p.onnx")
+
+
 @pytest.mark.parametrize(
     ("contract", "drone", "field", "wanted", "has"),
     [
@@ -136,6 +142,20 @@ def test_a_model_for_this_drone_fits():
             "action.yaw_rate_rps",
             "3",
             "1",
+        ),
+        (
+            {"action": ActionSpec(mode="forward")},
+            (LD19, MapSettings(), VehicleLimits(yaw_rate_rps=1.0)),
+            "action.yaw_rate_rps",
+            "3",
+            "1",
+        ),
+        (
+            {"action": ActionSpec(mode="waypoint")},
+            (LD19, MapSettings(), VehicleLimits(acceleration_mps2=0.5)),
+            "action.waypoint_braking_mps2",
+            "1",
+            "0.5",
         ),
         ({}, (LD19, MapSettings(), VehicleLimits(radius_m=0.25)), "limits.radius_m", "0.08", "0.25"),
     ],

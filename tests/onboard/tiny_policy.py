@@ -38,7 +38,7 @@ def make_model(contract: PolicyContract, action: tuple[float, ...] = (1.0, 0.0))
     output = helper.make_tensor_value_info("action", TensorProto.FLOAT, ["batch", len(action)])
     weights = {
         "answer": np.array(action, np.float32),
-        "zero": np.zeros((3, len(action)), np.float32),
+        "zero": np.zeros((*shapes["motion"], len(action)), np.float32),
         "shape": np.array([0, 3], np.int64),
     }
     nodes = [

@@ -33,6 +33,7 @@ def rollout_that_pays_for_going_east(actor, generator, steps=8, agents=32):
     return Rollout(
         observations, actions, log_probs.reshape(steps, agents), actions[..., 0].clone(),
         torch.ones((steps, agents), dtype=torch.bool), {key: value[-1] for key, value in observations.items()},
+        torch.ones((steps, agents), dtype=torch.bool),
     )  # fmt: skip
 
 

@@ -12,9 +12,19 @@ def inputs(spec, batch):
 
 
 @settings(max_examples=10, deadline=None)
-@given(st.integers(4, 24).map(lambda half: 2 * half), st.integers(4, 90), st.sampled_from([2, 3]), st.integers(1, 5))
-def test_any_observation_spec_gets_its_networks(cells, sectors, action_size, batch):
-    spec = ObservationSpec(view_cells=cells, lidar_sectors=sectors)
+@given(
+    st.integers(4, 24).map(lambda half: 2 * half),
+    st.integers(4, 90),
+    st.sampled_from([2, 3]),
+    st.integers(1, 5),
+    st.integers(0, 3),
+    st.booleans(),
+    st.sampled_from(["off", "self", "team"]),
+)
+def test_any_observation_spec_gets_its_networks(cells, sectors, action_size, batch, peers, placed, visits):
+    spec = ObservationSpec(
+        view_cells=cells, lidar_sectors=sectors, peers=peers, position=placed, heading=placed, visits=visits
+    )
     small = NetworkSettings(view_channels=(4, 4, 4), critic_channels=(4, 4), lidar_channels=2, hidden=16)
     mean = Actor(small, spec, action_size)(*inputs(spec, batch))
     assert mean.shape == (batch, action_size)

@@ -1,0 +1,90 @@
+"""The compiled loops of what drones know beyond their maps, over worlds `first` to `last` and their drones.
+
+Each calls for every drone the very kernel that its runner calls on board.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from imagine.core.action import intent_kernel
+from imagine.core.observation import MOTION, fill_options
+from imagine.core.visits import count_peer_visits, count_visit, fill_visits
+
+
+@numba.njit(cache=True, nogil=True)
+def take_decisions(first, last, intents, actions, parameters, poses):  # type: ignore[no-untyped-def]
+    """Turn actions `[world, drone, size]` into `intents` (float64 `[world, drone, 3]`), as taken at `poses`."""
+    size = actions.shape[2]
+    for world in range(first, last):
+        for drone in range(actions.shape[1]):
+            numbers = actions[world, drone]
+            third = np.float64(numbers[2]) if size > 2 else 0.0
+            x, y, yaw = poses[world, drone]
+            a, b, c = intent_kernel(np.float64(numbers[0]), np.float64(numbers[1]), third, parameters, x, y, yaw)
+            intents[world, drone, 0], intents[world, drone, 1], intents[world, drone, 2] = a, b, c
+
+
+@numba.njit(cache=True, nogil=True)
+def hear_peers(first, last, positions, ages, connected, poses, dt, active):  # type: ignore[no-untyped-def]
+    """Let a tick of `dt` seconds pass and note where the peers are that are heard now.
+
+    `positions` float64 `[world, drone, peer, 2]` and `ages` `[world, drone, peer]` as in `PeerPoses`, a drone's own
+    age staying inf; `connected` bool `[world, sender, receiver]`.
+    """
+    drones = poses.shape[1]
+    for world in range(first, last):
+        if not active[world]:
+            continue
+        for drone in range(drones):
+            for peer in range(drones):
+                if peer == drone:
+                    continue
+                ages[world, drone, peer] += dt
+                if connected[world, peer, drone]:
+                    ages[world, drone, peer] = 0.0
+                    positions[world, drone, peer, 0] = poses[world, peer, 0]
+                    positions[world, drone, peer, 1] = poses[world, peer, 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def count_visits(first, last, own, peers, team, positions, ages, poses, origins, alive, active):  # type: ignore[no-untyped-def]
+    """Add a tick to every living drone's visits: `own`, and with `team` also `peers` (uint16 `[world, drone, r, c]`).
+
+    `alive` bool `[world, drone]`; the grids' origins `[world, 2]` in map cells.
+    """
+    for world in range(first, last):
+        if not active[world]:
+            continue
+        column0, row0 = origins[world]
+        for drone in range(poses.shape[1]):
+            if not alive[world, drone]:
+                continue
+            count_visit(own[world, drone], column0, row0, poses[world, drone, 0], poses[world, drone, 1])
+            if team:
+                count_peer_visits(peers[world, drone], column0, row0, positions[world, drone], ages[world, drone])
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_option_numbers(first, last, motion, positions, ages, poses, options):  # type: ignore[no-untyped-def]
+    """Fill what of `motion` (float32 `[world, drone, numbers]`) the options add."""
+    for world in range(first, last):
+        for drone in range(motion.shape[1]):
+            x, y, yaw = poses[world, drone]
+            fill_options(motion[world, drone, MOTION:], x, y, yaw, positions[world, drone], ages[world, drone], options)
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_visit_views(  # type: ignore[no-untyped-def]
+    first, last, views, own, peers, team, origins, poses, heading_axes, scales, levels
+):
+    """Fill what of `views` (float32 `[world, drone, channels, n, n]`) lies behind the maps: the visits."""
+    maps = 2 * len(scales)
+    for world in range(first, last):
+        for drone in range(views.shape[1]):
+            x, y, yaw = poses[world, drone]
+            fill_visits(
+                views[world, drone, maps:], own[world, drone], peers[world, drone], team,
+                origins[world, 0], origins[world, 1], x, y, yaw if heading_axes else 0.0, scales, levels,
+            )  # fmt: skip
