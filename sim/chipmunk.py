@@ -10,10 +10,9 @@ import platform
 import sys
 from typing import Any
 
-import numba
 import numpy as np
 import pymunk._chipmunk_cffi as chipmunk
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
@@ -61,14 +60,15 @@ def addresses() -> NDArray[np.int64]:
 _POINTER = ir.IntType(64)
 _DOUBLE = ir.DoubleType()
 _VECTOR = ir.LiteralStructType([_DOUBLE, _DOUBLE])
-_PAIR = types.UniTuple(types.float64, 2)
+_PAIR: Any = types.UniTuple(types.float64, 2)  # type: ignore[no-untyped-call]
 
 
 def _call(context: Any, builder: Any, signature: Any, values: Any, result: Any) -> Any:
     """Emit the call of the function at an address with the members of a tuple (addresses, integers or doubles)."""
     address, packed = values
     arguments = []
-    for value, kind in zip(cgutils.unpack_tuple(builder, packed), signature.args[1].types, strict=True):
+    members = cgutils.unpack_tuple(builder, packed)  # type: ignore[no-untyped-call]
+    for value, kind in zip(members, signature.args[1].types, strict=True):
         wanted = types.float64 if isinstance(kind, types.Float) else types.int64
         arguments.append(context.cast(builder, value, kind, wanted))
     function_type = ir.FunctionType(result, [argument.type for argument in arguments])
@@ -138,15 +138,3 @@ def store(typing_context, address, value):  # type: ignore[no-untyped-def]
         return context.get_dummy_value()
 
     return types.void(types.int64, types.int64), generate
-
-
-@numba.njit(cache=True, nogil=True)
-def position_of(api, body):  # type: ignore[no-untyped-def]
-    """Return a body's x and y, metres."""
-    return call_vector(api[BODY_POSITION], (body,))
-
-
-@numba.njit(cache=True, nogil=True)
-def velocity_of(api, body):  # type: ignore[no-untyped-def]
-    """Return a body's velocity along x and y, metres a second."""
-    return call_vector(api[BODY_VELOCITY], (body,))

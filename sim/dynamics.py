@@ -102,38 +102,44 @@ LAG, ACCELERATION, DRAG, MASS, DELAY, WIND, CORRELATION, YAW_BLEND, BLEND, REACH
 COLUMNS = 12
 
 
+# Kernels get whole arrays and indices: each slice made in an inner loop would count references, with a bus lock.
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def blow(wind, dynamics, key, age):  # type: ignore[no-untyped-def]
-    """Bring a world's wind (m/s, map frame, `[drones, 2]`) to its tick `age`: a sampled Ornstein-Uhlenbeck process."""
-    for drone in range(len(wind)):
-        std = dynamics[drone, WIND]
+def blow(world, wind, dynamics, key, age):  # type: ignore[no-untyped-def]
+    """Bring a world's wind (m/s, map frame) to its tick `age`: a sampled Ornstein-Uhlenbeck process.
+
+    `wind` `[worlds, drones, 2]`, `dynamics` `[worlds, drones, COLUMNS]`, `key` uint64 of the world and episode.
+    """
+    drones = wind.shape[1]
+    for drone in range(drones):
+        std = dynamics[world, drone, WIND]
         if std == 0.0:
-            wind[drone] = 0.0
             continue
-        keep = dynamics[drone, WIND_KEPT] if age > 0 else 0.0
+        keep = dynamics[world, drone, WIND_KEPT] if age > 0 else 0.0
         fresh = std * math.sqrt(1.0 - keep * keep)
         for axis in range(2):
-            number = gauss(key, (age * len(wind) + drone) * 2 + axis)
-            wind[drone, axis] = keep * wind[drone, axis] + fresh * number
+            number = gauss(key, (age * drones + drone) * 2 + axis)
+            wind[world, drone, axis] = keep * wind[world, drone, axis] + fresh * number
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def keep_setpoint(history, age, setpoint, speed, yaw_rate):  # type: ignore[no-untyped-def]
-    """Put tick `age`'s setpoint (forward, left, yaw rate), cut to the limits, into the ring `[HISTORY, 3]`."""
-    forward, left = setpoint[0], setpoint[1]
+def keep_setpoint(world, drone, history, age, setpoints, speed, yaw_rate):  # type: ignore[no-untyped-def]
+    """Put tick `age`'s setpoint (forward, left, yaw rate), cut to the limits, into the ring `[..., HISTORY, 3]`."""
+    forward, left, rate = setpoints[world, drone, 0], setpoints[world, drone, 1], setpoints[world, drone, 2]
     size = math.sqrt(forward * forward + left * left)
     if size > speed:
         forward, left = forward * speed / size, left * speed / size
     slot = age % HISTORY
-    history[slot, 0], history[slot, 1] = forward, left
-    history[slot, 2] = min(max(setpoint[2], -yaw_rate), yaw_rate)
+    history[world, drone, slot, 0], history[world, drone, slot, 1] = forward, left
+    history[world, drone, slot, 2] = min(max(rate, -yaw_rate), yaw_rate)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def delayed(history, age, substep, delay_s):  # type: ignore[no-untyped-def]
+def delayed(world, drone, history, age, substep, delay_s):  # type: ignore[no-untyped-def]
     """Return the mean setpoint (forward, left, yaw rate) that acts during a substep of tick `age`.
 
-    `history` `[HISTORY, 3]` is a ring with one setpoint a tick; before the first one the drone is told to hover.
+    `history` `[worlds, drones, HISTORY, 3]` is a ring with one setpoint a tick; before the first one drones hover.
     """
     late = delay_s / SUBSTEP_S
     whole = int(late)
@@ -143,26 +149,29 @@ def delayed(history, age, substep, delay_s):  # type: ignore[no-untyped-def]
     forward, left, rate = 0.0, 0.0, 0.0
     if newer >= 0:
         slot = newer % HISTORY
-        forward, left, rate = history[slot, 0], history[slot, 1], history[slot, 2]
+        forward, left = history[world, drone, slot, 0], history[world, drone, slot, 1]
+        rate = history[world, drone, slot, 2]
     if part > 0.0 and newer != older:
         forward, left, rate = (1.0 - part) * forward, (1.0 - part) * left, (1.0 - part) * rate
         if older >= 0:
             slot = older % HISTORY
-            forward += part * history[slot, 0]
-            left += part * history[slot, 1]
-            rate += part * history[slot, 2]
+            forward += part * history[world, drone, slot, 0]
+            left += part * history[world, drone, slot, 1]
+            rate += part * history[world, drone, slot, 2]
     return forward, left, rate
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def acceleration_for(forward, left, yaw, vx, vy, wind_x, wind_y, dynamics):  # type: ignore[no-untyped-def]
-    """Return the acceleration (m/s², map frame) of a substep toward a body setpoint."""
+def acceleration_for(world, drone, forward, left, yaw, vx, vy, wind, dynamics):  # type: ignore[no-untyped-def]
+    """Return the acceleration (m/s², map frame) of a substep toward a body setpoint; arrays as `blow` takes them."""
+    wind_x, wind_y = wind[world, drone, 0], wind[world, drone, 1]
     c, s = math.cos(yaw), math.sin(yaw)
-    reached, rate = dynamics[REACHED], dynamics[BLEND] / SUBSTEP_S
-    drag_x, drag_y = dynamics[LOSS] * (vx - wind_x), dynamics[LOSS] * (vy - wind_y)
+    reached, rate = dynamics[world, drone, REACHED], dynamics[world, drone, BLEND] / SUBSTEP_S
+    loss, limit = dynamics[world, drone, LOSS], dynamics[world, drone, ACCELERATION]
+    drag_x, drag_y = loss * (vx - wind_x), loss * (vy - wind_y)
     ax = ((c * forward - s * left) * reached + wind_x - vx) * rate + drag_x
     ay = ((s * forward + c * left) * reached + wind_y - vy) * rate + drag_y
     size = math.sqrt(ax * ax + ay * ay)
-    if size > dynamics[ACCELERATION]:
-        ax, ay = ax * dynamics[ACCELERATION] / size, ay * dynamics[ACCELERATION] / size
+    if size > limit:
+        ax, ay = ax * limit / size, ay * limit / size
     return ax - drag_x, ay - drag_y

@@ -28,7 +28,7 @@ _TOUCH_M = 0.001  # what counts as touching a person
 _LAUNCH_CLEARANCE_M = 0.5  # people start no nearer to a drone
 _START_DRAWS = 20
 
-SPEED, RADIUS, ALONG, X, Y = range(5)  # columns of people
+SPEED, RADIUS, ALONG, X, Y, FROM_X, FROM_Y = range(7)  # columns of people
 HALF_WIDTH, HALF_DEPTH, CRATE_MASS, CRATE_X, CRATE_Y, CRATE_YAW = range(6)  # columns of crates
 
 
@@ -36,11 +36,11 @@ HALF_WIDTH, HALF_DEPTH, CRATE_MASS, CRATE_X, CRATE_Y, CRATE_YAW = range(6)  # co
 class Movers:
     """People and crates of all worlds; rows past a world's own are absent.
 
-    `loops` float64 `[worlds, people, waypoints, 2]`, m; `walks` int64 `[worlds, people, 2]`: waypoints (0 absent) and
-    the one walked from; `people` float64 `[worlds, people, 5]`: speed, radius, way along the leg, x, y; `crates`
-    float64 `[worlds, crates, 6]`: half width and depth, mass (0 absent), x, y, yaw. Of these LiDARs see `discs`
-    `[worlds, people, 3]` (x, y, radius; radius 0 absent) and `edges` `[worlds, 4 crates, 4]` (x0, y0, x1, y1; all 0
-    absent).
+    Metres, radians and seconds: `loops` float64 `[worlds, people, waypoints, 2]`; `walks` int64 `[worlds, people,
+    2]`: waypoints (0 absent) and the one walked from; `people` float64 `[worlds, people, 7]`: speed, radius, way
+    along the leg, place, and place a substep ago; `crates` float64 `[worlds, crates, 6]`: half width and depth,
+    mass (0 absent), x, y, yaw. Of these LiDARs see `discs` `[worlds, people, 3]` (x, y, radius; radius 0 absent)
+    and `edges` `[worlds, 4 crates, 4]` (x0, y0, x1, y1; all 0 absent).
     """
 
     loops: NDArray[np.float64]
@@ -54,7 +54,7 @@ class Movers:
     def none(cls, worlds: int) -> Movers:
         """Return worlds in which nothing moves by itself."""
         return cls(
-            np.zeros((worlds, 0, 0, 2)), np.zeros((worlds, 0, 2), np.int64), np.zeros((worlds, 0, 5)),
+            np.zeros((worlds, 0, 0, 2)), np.zeros((worlds, 0, 2), np.int64), np.zeros((worlds, 0, 7)),
             np.zeros((worlds, 0, 6)), np.zeros((worlds, 0, 3)), np.zeros((worlds, 0, 4)),
         )  # fmt: skip
 
@@ -90,13 +90,13 @@ class Movers:
             self.people[world, index, SPEED], self.people[world, index, RADIUS] = person.speed_mps, person.radius
             self.walks[world, index, 0] = count
             for share in rng.random(_START_DRAWS):
-                _start(self.loops[world, index], self.walks[world, index], self.people[world, index], share)
-                x, y = self.people[world, index, X:]
+                start_walk(world, index, self.loops, self.walks, self.people, float(share))
+                x, y = self.people[world, index, X], self.people[world, index, Y]
                 room = drone_radius_m + person.radius + _LAUNCH_CLEARANCE_M
                 clear_of_drones = all(math.hypot(x - p.x, y - p.y) >= room for p in launches)
-                if clear_of_drones and not _crate_within(self.crates[world], x, y, person.radius):
+                if clear_of_drones and not _crate_within(world, self.crates, x, y, person.radius):
                     break
-        show_movers(self.people[world], self.crates[world], self.discs[world], self.edges[world])
+        show_movers(world, self.people, self.crates, self.discs, self.edges)
 
 
 def _widened(array: NDArray[np.generic], *sizes: int) -> NDArray:  # type: ignore[type-arg]
@@ -106,12 +106,16 @@ def _widened(array: NDArray[np.generic], *sizes: int) -> NDArray:  # type: ignor
     return grown
 
 
+# Kernels get whole arrays and indices: each slice made in an inner loop would count references, with a bus lock.
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _leg(loop, walk):  # type: ignore[no-untyped-def]
-    """Return where the leg that is walked begins, its direction and its length."""
-    following = walk[1] + 1 if walk[1] + 1 < walk[0] else 0
-    x, y = loop[walk[1], 0], loop[walk[1], 1]
-    dx, dy = loop[following, 0] - x, loop[following, 1] - y
+def _leg(world, k, loops, walks):  # type: ignore[no-untyped-def]
+    """Return where the leg that person `k` walks begins, its direction and its length."""
+    leg = walks[world, k, 1]
+    following = leg + 1 if leg + 1 < walks[world, k, 0] else 0
+    x, y = loops[world, k, leg, 0], loops[world, k, leg, 1]
+    dx, dy = loops[world, k, following, 0] - x, loops[world, k, following, 1] - y
     length = math.sqrt(dx * dx + dy * dy)
     if length == 0.0:
         return x, y, 0.0, 0.0, 0.0
@@ -119,82 +123,85 @@ def _leg(loop, walk):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _start(loop, walk, person, share):  # type: ignore[no-untyped-def]
+def start_walk(world, k, loops, walks, people, share):  # type: ignore[no-untyped-def]
     """Put a person on their loop, after a share of its length."""
     total = 0.0
-    for leg in range(walk[0]):
-        walk[1] = leg
-        total += _leg(loop, walk)[4]
-    walk[1], person[ALONG] = 0, 0.0
-    _walk(loop, walk, person, share * total)
+    for leg in range(walks[world, k, 0]):
+        walks[world, k, 1] = leg
+        total += _leg(world, k, loops, walks)[4]
+    walks[world, k, 1], people[world, k, ALONG] = 0, 0.0
+    _walk(world, k, loops, walks, people, share * total)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _walk(loop, walk, person, way):  # type: ignore[no-untyped-def]
+def _walk(world, k, loops, walks, people, way):  # type: ignore[no-untyped-def]
     """Bring a person `way` metres further along their loop."""
-    person[ALONG] += way
-    x, y, ux, uy, length = _leg(loop, walk)
-    for _ in range(2 * walk[0]):  # a step is shorter than any loop worth walking; this ends on all others, too
-        if person[ALONG] < length:
+    along = people[world, k, ALONG] + way
+    x, y, ux, uy, length = _leg(world, k, loops, walks)
+    for _ in range(2 * walks[world, k, 0]):  # a step is shorter than a loop worth walking; this ends on others, too
+        if along < length:
             break
-        person[ALONG] -= length
-        walk[1] = walk[1] + 1 if walk[1] + 1 < walk[0] else 0
-        x, y, ux, uy, length = _leg(loop, walk)
-    person[X], person[Y] = x + ux * person[ALONG], y + uy * person[ALONG]
+        along -= length
+        walks[world, k, 1] = walks[world, k, 1] + 1 if walks[world, k, 1] + 1 < walks[world, k, 0] else 0
+        x, y, ux, uy, length = _leg(world, k, loops, walks)
+    people[world, k, ALONG] = along
+    people[world, k, X], people[world, k, Y] = x + ux * along, y + uy * along
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _distance_to_crate(crate, x, y):  # type: ignore[no-untyped-def]
+def _distance_to_crate(world, k, crates, x, y):  # type: ignore[no-untyped-def]
     """Return the distance from a point to a crate, 0 inside."""
-    c, s = math.cos(crate[CRATE_YAW]), math.sin(crate[CRATE_YAW])
-    dx, dy = x - crate[CRATE_X], y - crate[CRATE_Y]
-    beside = max(abs(c * dx + s * dy) - crate[HALF_WIDTH], 0.0)
-    before = max(abs(c * dy - s * dx) - crate[HALF_DEPTH], 0.0)
+    c, s = math.cos(crates[world, k, CRATE_YAW]), math.sin(crates[world, k, CRATE_YAW])
+    dx, dy = x - crates[world, k, CRATE_X], y - crates[world, k, CRATE_Y]
+    beside = max(abs(c * dx + s * dy) - crates[world, k, HALF_WIDTH], 0.0)
+    before = max(abs(c * dy - s * dx) - crates[world, k, HALF_DEPTH], 0.0)
     return math.sqrt(beside * beside + before * before)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _crate_within(crates, x, y, radius):  # type: ignore[no-untyped-def]
+def _crate_within(world, crates, x, y, radius):  # type: ignore[no-untyped-def]
     within = False
-    for k in range(len(crates)):
-        within |= crates[k, CRATE_MASS] > 0.0 and _distance_to_crate(crates[k], x, y) < radius
+    for k in range(crates.shape[1]):
+        within |= crates[world, k, CRATE_MASS] > 0.0 and _distance_to_crate(world, k, crates, x, y) < radius
     return within
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def walk_people(loops, walks, people, crates):  # type: ignore[no-untyped-def]
+def walk_people(world, loops, walks, people, crates):  # type: ignore[no-untyped-def]
     """Move a world's people on by one substep, but not into a crate."""
-    for k in range(len(people)):
-        if walks[k, 0] == 0:
+    for k in range(people.shape[1]):
+        people[world, k, FROM_X], people[world, k, FROM_Y] = people[world, k, X], people[world, k, Y]
+        if walks[world, k, 0] == 0:
             continue
-        way = people[k, SPEED] * SUBSTEP_S
-        along, leg, x, y = people[k, ALONG], walks[k, 1], people[k, X], people[k, Y]
-        _walk(loops[k], walks[k], people[k], way)
-        for c in range(len(crates)):
-            if crates[c, CRATE_MASS] > 0.0:
-                distance = _distance_to_crate(crates[c], people[k, X], people[k, Y])
-                if distance < people[k, RADIUS] and distance <= _distance_to_crate(crates[c], x, y):
-                    people[k, ALONG], walks[k, 1], people[k, X], people[k, Y] = along, leg, x, y
-                    break
+        along, leg, x, y = people[world, k, ALONG], walks[world, k, 1], people[world, k, X], people[world, k, Y]
+        _walk(world, k, loops, walks, people, people[world, k, SPEED] * SUBSTEP_S)
+        for c in range(crates.shape[1]):
+            if crates[world, c, CRATE_MASS] == 0.0:
+                continue
+            distance = _distance_to_crate(world, c, crates, people[world, k, X], people[world, k, Y])
+            if distance < people[world, k, RADIUS] and distance <= _distance_to_crate(world, c, crates, x, y):
+                people[world, k, ALONG], walks[world, k, 1] = along, leg
+                people[world, k, X], people[world, k, Y] = x, y
+                break
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def pushed(x, y, vx, vy, ax, ay, people, before, radius):  # type: ignore[no-untyped-def]
+def pushed(world, x, y, vx, vy, ax, ay, people, radius):  # type: ignore[no-untyped-def]
     """Return a drone's acceleration so that it does not go into a person, and is moved out of one.
 
-    `x, y` is where the drone will be after this substep, `vx, vy` its velocity now, `before` `[people, 2]` where the
-    people, who are where they will be, come from.
+    `x, y` is where the drone will be after this substep, as the people are already; `vx, vy` its velocity now.
     """
-    for k in range(len(people)):
-        if people[k, RADIUS] == 0.0:
+    for k in range(people.shape[1]):
+        if people[world, k, RADIUS] == 0.0:
             continue
-        dx, dy = x - people[k, X], y - people[k, Y]
+        dx, dy = x - people[world, k, X], y - people[world, k, Y]
         distance = math.sqrt(dx * dx + dy * dy)
-        gap = distance - people[k, RADIUS] - radius
+        gap = distance - people[world, k, RADIUS] - radius
         if gap > _NEAR_M or distance == 0.0:
             continue  # out of reach; or right in the middle, where every way is out
         nx, ny = dx / distance, dy / distance
-        wx, wy = (people[k, X] - before[k, 0]) / SUBSTEP_S, (people[k, Y] - before[k, 1]) / SUBSTEP_S
+        wx = (people[world, k, X] - people[world, k, FROM_X]) / SUBSTEP_S
+        wy = (people[world, k, Y] - people[world, k, FROM_Y]) / SUBSTEP_S
         parting = (vx + ax * SUBSTEP_S - wx) * nx + (vy + ay * SUBSTEP_S - wy) * ny
         least = -gap / SUBSTEP_S if gap > 0.0 else min(-gap / SUBSTEP_S, _PUSH_OUT_MPS)
         if parting < least:
@@ -204,32 +211,37 @@ def pushed(x, y, vx, vy, ax, ay, people, before, radius):  # type: ignore[no-unt
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def touches_person(x, y, people, radius):  # type: ignore[no-untyped-def]
+def touches_person(world, x, y, people, radius):  # type: ignore[no-untyped-def]
     """Tell whether a drone at (x, y) touches somebody."""
-    for k in range(len(people)):
-        reach = people[k, RADIUS] + radius + _TOUCH_M
-        dx, dy = x - people[k, X], y - people[k, Y]
-        if people[k, RADIUS] > 0.0 and dx * dx + dy * dy < reach * reach:
-            return True
-    return False
+    touches = False
+    for k in range(people.shape[1]):
+        reach = people[world, k, RADIUS] + radius + _TOUCH_M
+        dx, dy = x - people[world, k, X], y - people[world, k, Y]
+        touches |= people[world, k, RADIUS] > 0.0 and dx * dx + dy * dy < reach * reach
+    return touches
+
+
+@numba.njit(cache=True, nogil=True)
+def moment_of_box(mass, half_width, half_depth):  # type: ignore[no-untyped-def]
+    """Return a full box's moment of inertia about its centre, kg m²."""
+    return mass * (half_width * half_width + half_depth * half_depth) / 3.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def show_movers(people, crates, discs, edges):  # type: ignore[no-untyped-def]
+def show_movers(world, people, crates, discs, edges):  # type: ignore[no-untyped-def]
     """Write what LiDARs see of a world's people and crates into `discs` and `edges`."""
-    for k in range(len(people)):
-        discs[k, 0], discs[k, 1], discs[k, 2] = people[k, X], people[k, Y], people[k, RADIUS]
-    corners = np.empty((4, 2))
-    for k in range(len(crates)):
-        if crates[k, CRATE_MASS] == 0.0:
+    for k in range(people.shape[1]):
+        discs[world, k, 0], discs[world, k, 1] = people[world, k, X], people[world, k, Y]
+        discs[world, k, 2] = people[world, k, RADIUS]
+    for k in range(crates.shape[1]):
+        if crates[world, k, CRATE_MASS] == 0.0:
             continue
-        c, s = math.cos(crates[k, CRATE_YAW]), math.sin(crates[k, CRATE_YAW])
-        for corner in range(4):
-            across = crates[k, HALF_WIDTH] if corner in (1, 2) else -crates[k, HALF_WIDTH]
-            along = crates[k, HALF_DEPTH] if corner >= 2 else -crates[k, HALF_DEPTH]
-            corners[corner, 0] = crates[k, CRATE_X] + c * across - s * along
-            corners[corner, 1] = crates[k, CRATE_Y] + s * across + c * along
-        for corner in range(4):
-            following = (corner + 1) % 4
-            edges[4 * k + corner, 0], edges[4 * k + corner, 1] = corners[corner, 0], corners[corner, 1]
-            edges[4 * k + corner, 2], edges[4 * k + corner, 3] = corners[following, 0], corners[following, 1]
+        c, s = math.cos(crates[world, k, CRATE_YAW]), math.sin(crates[world, k, CRATE_YAW])
+        for corner in range(4):  # counter-clockwise; each begins one edge and ends the one before
+            across = crates[world, k, HALF_WIDTH] if corner in (1, 2) else -crates[world, k, HALF_WIDTH]
+            along = crates[world, k, HALF_DEPTH] if corner >= 2 else -crates[world, k, HALF_DEPTH]
+            x = crates[world, k, CRATE_X] + c * across - s * along
+            y = crates[world, k, CRATE_Y] + s * across + c * along
+            begun, ended = 4 * k + corner, 4 * k + (corner + 3) % 4
+            edges[world, begun, 0], edges[world, begun, 1] = x, y
+            edges[world, ended, 2], edges[world, ended, 3] = x, y

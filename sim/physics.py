@@ -8,17 +8,18 @@ from __future__ import annotations
 import math
 
 import numba
-import numpy as np
 from numba.core import types
 
 from imagine.sim.chipmunk import (
     ARBITER_BODIES,
     BODY_ANGLE,
     BODY_ANGULAR_VELOCITY,
+    BODY_POSITION,
     BODY_SET_FORCE,
     BODY_SET_POSITION,
     BODY_SET_TORQUE,
     BODY_SET_VELOCITY,
+    BODY_VELOCITY,
     SPACE_ADD_BODY,
     SPACE_ADD_SHAPE,
     SPACE_REMOVE_BODY,
@@ -26,11 +27,10 @@ from imagine.sim.chipmunk import (
     SPACE_STEP,
     call_address,
     call_double,
+    call_vector,
     call_void,
     load,
-    position_of,
     store,
-    velocity_of,
 )
 from imagine.sim.dynamics import (
     DELAY,
@@ -53,6 +53,7 @@ from imagine.sim.movers import (
     HALF_WIDTH,
     X,
     Y,
+    moment_of_box,
     pushed,
     show_movers,
     touches_person,
@@ -61,8 +62,9 @@ from imagine.sim.movers import (
 
 WALLS, DRONES, MOVERS = range(3)
 """What contacts are counted of: rows of the counts and of the tally."""
-APART_SUBSTEPS = 3
-"""A contact is a new one after so many substeps without touch; the solver forgets contacts after as many."""
+APART_SUBSTEPS = 10
+"""A touch this many substeps (0.2 s) after the last one of its kind belongs to the same contact: who slides along a
+wall of many edges, or bounces, has met it once."""
 NEVER = -1_000_000
 
 # A row of the tally is what a callback is given: addresses, and what it cannot be told otherwise.
@@ -118,72 +120,71 @@ def step_worlds(  # type: ignore[no-untyped-def]
     """
     speed, fastest_yaw, radius = limits
     drones = poses.shape[1]
-    before = np.empty((people.shape[1], 2))
     for world in range(first, last):
-        space, age = spaces[world], ages[world]
-        blow(wind[world], dynamics[world], keys[world], age)
+        age = ages[world]
+        blow(world, wind, dynamics, keys[world], age)
         for drone in range(drones):
-            keep_setpoint(history[world, drone], age, setpoints[world, drone], speed, fastest_yaw)
+            keep_setpoint(world, drone, history, age, setpoints, speed, fastest_yaw)
             if alive[world, drone] != present[world, drone]:
-                _fall_or_rise(api, space, bodies[world, drone], shapes[world, drone], alive[world, drone])
+                _fall_or_rise(api, spaces[world], bodies[world, drone], shapes[world, drone], alive[world, drone])
                 present[world, drone] = alive[world, drone]
-                velocity[world, drone, :] = 0.0
+                for axis in range(3):
+                    velocity[world, drone, axis] = 0.0
         crowded, cluttered = False, False
         for k in range(people.shape[1]):
             crowded |= walks[world, k, 0] > 0
         for k in range(crates.shape[1]):
-            cluttered |= crates[world, k, CRATE_MASS] > 0.0
+            cluttered |= boxes[world, k] != 0
         for substep in range(SUBSTEPS):
             clock = age * SUBSTEPS + substep
             for kind in range(3):
                 tally[world, kind, _CLOCK] = clock
             if crowded:
-                before[:, 0], before[:, 1] = people[world, :, X], people[world, :, Y]
-                walk_people(loops[world], walks[world], people[world], crates[world])
+                walk_people(world, loops, walks, people, crates)
             for drone in range(drones):
                 if not alive[world, drone]:
                     continue
-                body, own = bodies[world, drone], dynamics[world, drone]
-                forward, left, rate = delayed(history[world, drone], age, substep, own[DELAY])
+                body, mass = bodies[world, drone], dynamics[world, drone, MASS]
+                forward, left, rate = delayed(world, drone, history, age, substep, dynamics[world, drone, DELAY])
                 vx, vy = velocity[world, drone, 0], velocity[world, drone, 1]
-                # Forces, not velocities: the solver then stops what pushes into a wall before positions move.
-                ax, ay = acceleration_for(
-                    forward, left, poses[world, drone, 2], vx, vy, wind[world, drone, 0], wind[world, drone, 1], own
-                )
+                ax, ay = acceleration_for(world, drone, forward, left, poses[world, drone, 2], vx, vy, wind, dynamics)
                 if crowded:
-                    x, y = position_of(api, body)
-                    ax, ay = pushed(
-                        x + vx * SUBSTEP_S, y + vy * SUBSTEP_S, vx, vy, ax, ay, people[world], before, radius
-                    )
-                call_void(api[BODY_SET_FORCE], (body, own[MASS] * ax, own[MASS] * ay))
-                velocity[world, drone, 2] += (rate - velocity[world, drone, 2]) * own[YAW_BLEND]
+                    x, y = call_vector(api[BODY_POSITION], (body,))
+                    ax, ay = pushed(world, x + vx * SUBSTEP_S, y + vy * SUBSTEP_S, vx, vy, ax, ay, people, radius)
+                # Forces, not velocities: the solver then stops what pushes into a wall before positions move.
+                call_void(api[BODY_SET_FORCE], (body, mass * ax, mass * ay))
+                velocity[world, drone, 2] += (rate - velocity[world, drone, 2]) * dynamics[world, drone, YAW_BLEND]
                 poses[world, drone, 2] += velocity[world, drone, 2] * SUBSTEP_S
             if cluttered:
-                _roll(api, crates[world], boxes[world])
+                _roll(api, world, crates, boxes)
                 for k in range(people.shape[1]):
                     if walkers[world, k] != 0:
                         call_void(api[BODY_SET_POSITION], (walkers[world, k], people[world, k, X], people[world, k, Y]))
-            call_void(api[SPACE_STEP], (space, SUBSTEP_S))
+            call_void(api[SPACE_STEP], (spaces[world], SUBSTEP_S))
             for drone in range(drones):
                 if not alive[world, drone]:
                     continue
-                velocity[world, drone, 0], velocity[world, drone, 1] = velocity_of(api, bodies[world, drone])
+                velocity[world, drone, 0], velocity[world, drone, 1] = call_vector(
+                    api[BODY_VELOCITY], (bodies[world, drone],)
+                )
                 if crowded:
-                    x, y = position_of(api, bodies[world, drone])
-                    if touches_person(x, y, people[world], radius):
-                        if clock - last_touch[world, MOVERS, drone] > APART_SUBSTEPS:
+                    x, y = call_vector(api[BODY_POSITION], (bodies[world, drone],))
+                    if touches_person(world, x, y, people, radius):
+                        if clock - last_touch[MOVERS, world, drone] > APART_SUBSTEPS:
                             counts[MOVERS, world, drone] += 1
-                        last_touch[world, MOVERS, drone] = clock
+                        last_touch[MOVERS, world, drone] = clock
             if cluttered:
-                _read_crates(api, crates[world], boxes[world])
+                _read_crates(api, world, crates, boxes)
         for drone in range(drones):
             if alive[world, drone]:
-                poses[world, drone, 0], poses[world, drone, 1] = position_of(api, bodies[world, drone])
+                poses[world, drone, 0], poses[world, drone, 1] = call_vector(
+                    api[BODY_POSITION], (bodies[world, drone],)
+                )
                 poses[world, drone, 2] = (poses[world, drone, 2] + math.pi) % (2.0 * math.pi) - math.pi
             contacts[world, drone] = counts[WALLS, world, drone] + counts[DRONES, world, drone]
             contacts[world, drone] += counts[MOVERS, world, drone]
         if crowded or cluttered:
-            show_movers(people[world], crates[world], discs[world], edges[world])
+            show_movers(world, people, crates, discs, edges)
         ages[world] = age + 1
 
 
@@ -200,23 +201,24 @@ def _fall_or_rise(api, space, body, shape, alive):  # type: ignore[no-untyped-de
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _roll(api, crates, boxes):  # type: ignore[no-untyped-def]
+def _roll(api, world, crates, boxes):  # type: ignore[no-untyped-def]
     """Brake a world's crates, in speed and turning."""
-    for k in range(len(crates)):
-        if boxes[k] == 0:
+    for k in range(crates.shape[1]):
+        box = boxes[world, k]
+        if box == 0:
             continue
-        mass, width, depth = crates[k, CRATE_MASS], 2.0 * crates[k, HALF_WIDTH], 2.0 * crates[k, HALF_DEPTH]
-        vx, vy = velocity_of(api, boxes[k])
-        call_void(api[BODY_SET_FORCE], (boxes[k], -mass * _CRATE_LOSS * vx, -mass * _CRATE_LOSS * vy))
-        turning = call_double(api[BODY_ANGULAR_VELOCITY], (boxes[k],))
-        moment = mass * (width * width + depth * depth) / 12.0
-        call_void(api[BODY_SET_TORQUE], (boxes[k], -moment * _CRATE_LOSS * turning))
+        mass = crates[world, k, CRATE_MASS]
+        vx, vy = call_vector(api[BODY_VELOCITY], (box,))
+        call_void(api[BODY_SET_FORCE], (box, -mass * _CRATE_LOSS * vx, -mass * _CRATE_LOSS * vy))
+        turning = call_double(api[BODY_ANGULAR_VELOCITY], (box,))
+        moment = moment_of_box(mass, crates[world, k, HALF_WIDTH], crates[world, k, HALF_DEPTH])
+        call_void(api[BODY_SET_TORQUE], (box, -moment * _CRATE_LOSS * turning))
 
 
 @numba.njit(cache=True, nogil=True)
-def _read_crates(api, crates, boxes):  # type: ignore[no-untyped-def]
+def _read_crates(api, world, crates, boxes):  # type: ignore[no-untyped-def]
     """Take a world's crates' places from the solver."""
-    for k in range(len(crates)):
-        if boxes[k] != 0:
-            crates[k, CRATE_X], crates[k, CRATE_Y] = position_of(api, boxes[k])
-            crates[k, CRATE_YAW] = call_double(api[BODY_ANGLE], (boxes[k],))
+    for k in range(crates.shape[1]):
+        if boxes[world, k] != 0:
+            crates[world, k, CRATE_X], crates[world, k, CRATE_Y] = call_vector(api[BODY_POSITION], (boxes[world, k],))
+            crates[world, k, CRATE_YAW] = call_double(api[BODY_ANGLE], (boxes[world, k],))

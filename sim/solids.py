@@ -44,7 +44,18 @@ from imagine.sim.chipmunk import (
 )
 from imagine.sim.dynamics import MASS
 from imagine.sim.level import Level
-from imagine.sim.movers import CRATE_MASS, CRATE_X, CRATE_Y, CRATE_YAW, HALF_DEPTH, HALF_WIDTH, RADIUS, X, Y
+from imagine.sim.movers import (
+    CRATE_MASS,
+    CRATE_X,
+    CRATE_Y,
+    CRATE_YAW,
+    HALF_DEPTH,
+    HALF_WIDTH,
+    RADIUS,
+    X,
+    Y,
+    moment_of_box,
+)
 
 WALL, DRONE, CRATE, PERSON = 1, 2, 3, 4  # collision types
 _EVERYTHING = 1 << WALL | 1 << DRONE | 1 << CRATE | 1 << PERSON
@@ -150,7 +161,9 @@ def build_space(  # type: ignore[no-untyped-def]
     for k in range(len(crates)):
         if crates[k, CRATE_MASS] > 0.0:
             width, depth, mass = 2.0 * crates[k, HALF_WIDTH], 2.0 * crates[k, HALF_DEPTH], crates[k, CRATE_MASS]
-            body = call_address(api[BODY_NEW], (mass, mass * (width * width + depth * depth) / 12.0))
+            body = call_address(
+                api[BODY_NEW], (mass, moment_of_box(mass, crates[k, HALF_WIDTH], crates[k, HALF_DEPTH]))
+            )
             call_void(api[BODY_SET_POSITION], (body, crates[k, CRATE_X], crates[k, CRATE_Y]))
             call_void(api[BODY_SET_ANGLE], (body, crates[k, CRATE_YAW]))
             call_address(api[SPACE_ADD_BODY], (space, body))
