@@ -20,7 +20,7 @@ from pydantic import AfterValidator, Field
 
 from imagine.core.config import Settings
 from imagine.core.vehicle_limits import VehicleLimits
-from imagine.sim.noise import gauss
+from imagine.sim.keyed_noise import key_of
 
 TICK_S = 0.1
 """Simulated time of one step: one LiDAR turn."""
@@ -106,6 +106,14 @@ COLUMNS = 12
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _gauss(key, index):  # type: ignore[no-untyped-def]
+    """Return the standard normal number `index` of the stream `key` (uint64)."""
+    u = (np.float64(key_of(key, 2 * index) >> np.uint64(11)) + 1.0) / 9007199254740993.0
+    v = np.float64(key_of(key, 2 * index + 1) >> np.uint64(11)) / 9007199254740992.0
+    return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)  # Box and Muller 1958
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def blow(world, wind, dynamics, key, age):  # type: ignore[no-untyped-def]
     """Bring a world's wind (m/s, map frame) to its tick `age`: a sampled Ornstein-Uhlenbeck process.
 
@@ -119,7 +127,7 @@ def blow(world, wind, dynamics, key, age):  # type: ignore[no-untyped-def]
         keep = dynamics[world, drone, WIND_KEPT] if age > 0 else 0.0
         fresh = std * math.sqrt(1.0 - keep * keep)
         for axis in range(2):
-            number = gauss(key, (age * drones + drone) * 2 + axis)
+            number = _gauss(key, (age * drones + drone) * 2 + axis)
             wind[world, drone, axis] = keep * wind[world, drone, axis] + fresh * number
 
 

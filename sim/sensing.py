@@ -42,10 +42,12 @@ class Sensing:
         tick: int,
         discs: NDArray[np.float64],
         edges: NDArray[np.float64],
+        alive: NDArray[np.bool_],
     ) -> NDArray[np.float32]:
         """Return a turn of every drone's LiDAR, float32 `[worlds, drones, beams]`, taken at `poses` `[..., 3]`.
 
         `discs` `[worlds, n, 3]` and `edges` `[worlds, m, 4]` are what moves; of radius 0, or all 0, is absent.
+        Drones not `alive` `[worlds, drones]` are not seen, and their own rows are nan.
         Ranges in metres with the sensor's noise; inf no return, nan below the least range.
         """
         ranges = np.empty((self.worlds, self.drones, self.lidar.beams), np.float32)
@@ -55,7 +57,7 @@ class Sensing:
             self._geometry = _stack([level.segments for level in levels], [level.circles for level in levels])
         lidar = self.lidar
         self._workers.over(
-            self.worlds, _scan_worlds, ranges, *self._geometry, poses, drone_radius_m, discs, edges,
+            self.worlds, _scan_worlds, ranges, *self._geometry, poses, drone_radius_m, discs, edges, alive,
             (lidar.start, lidar.increment, lidar.range_min, lidar.range_max, lidar.noise_std), keys,
         )  # fmt: skip
         return ranges
@@ -78,20 +80,9 @@ def _stack(segments: list[NDArray[np.float64]], circles: list[NDArray[np.float64
 
 @numba.njit(cache=True, nogil=True)
 def _scan_worlds(  # type: ignore[no-untyped-def]
-    first,
-    last,
-    ranges,
-    segments,
-    segment_counts,
-    circles,
-    circle_counts,
-    poses,
-    drone_radius,
-    discs,
-    edges,
-    lidar,
-    keys,
-):
+    first, last, ranges, segments, segment_counts, circles, circle_counts, poses, drone_radius, discs, edges, alive,
+    lidar, keys,
+):  # fmt: skip
     """Fill `ranges` (float32 `[worlds, drones, beams]`) of worlds first to last.
 
     They see the level, the other drones, and noise drawn from the world's key.
@@ -107,7 +98,7 @@ def _scan_worlds(  # type: ignore[no-untyped-def]
                 round_things[post, k] = circles[world, post, k]
         count = posts
         for other in range(drones):
-            if other != drone:
+            if other != drone and alive[world, other]:
                 round_things[count, 0], round_things[count, 1] = poses[world, other, 0], poses[world, other, 1]
                 round_things[count, 2] = drone_radius
                 count += 1
@@ -127,4 +118,4 @@ def _scan_worlds(  # type: ignore[no-untyped-def]
         key = keys[world] * np.uint64(drones) + np.uint64(drone)
         add_noise(exact, key, noise_std, range_min, range_max)
         for beam in range(beams):
-            ranges[world, drone, beam] = exact[beam]
+            ranges[world, drone, beam] = exact[beam] if alive[world, drone] else np.nan

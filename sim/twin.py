@@ -28,8 +28,6 @@ from imagine.sim.workers import Workers
 
 __all__ = ["TICK_S", "Twin"]
 
-_OUT_OF_SIGHT_M = 1e6  # where LiDARs look for drones that lie on the floor
-
 
 class Twin:
     """Worlds of drones: poses and velocities `[worlds, drones, 3]`, in metres, radians and seconds, map frame.
@@ -206,14 +204,12 @@ class Twin:
         """Return a turn of every drone's LiDAR, float32 `[worlds, drones, beams]`: all that stands or moves about it.
 
         Ranges in metres with the sensor's noise; inf no return, nan below the least range. Fallen drones are not seen,
-        and see nothing.
+        and their own rows are nan.
         """
-        poses = self.poses
-        if not self.alive.all():
-            poses = np.where(self.alive[..., None], poses, _OUT_OF_SIGHT_M)
         return self._sensing.scan(
-            poses, self.velocity, self.limits.radius_m, self.ticks, self.mover_discs, self.mover_edges
-        )
+            self.poses, self.velocity, self.limits.radius_m, self.ticks, self.mover_discs, self.mover_edges,
+            alive=self.alive,
+        )  # fmt: skip
 
 
 def _widened(array: NDArray[np.int64], columns: int) -> NDArray[np.int64]:
