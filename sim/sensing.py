@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +19,11 @@ _Geometry = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], N
 class Sensing:
     """The LiDARs of `drones` drones in each of `worlds` worlds; every world shows a level."""
 
-    def __init__(self, worlds: int, drones: int, lidar: LidarSpec, seed: int, workers: Workers) -> None:
-        """Prepare the sensors; give each world its level before the first scan."""
+    def __init__(
+        self, worlds: int, drones: int, lidar: LidarSpec, seed: int, workers: Workers, world_keys: Sequence[int]
+    ) -> None:
+        """Prepare the sensors; give each world its level before the first scan. Noise follows the worlds' keys."""
+        self._world_keys = world_keys
         self.worlds, self.drones, self.lidar, self.seed = worlds, drones, lidar, seed
         self._workers = workers
         self._levels: list[Level | None] = [None] * worlds
@@ -29,19 +34,30 @@ class Sensing:
         self._levels[world] = level
         self._geometry = None
 
-    def scan(self, poses: NDArray[np.float64], drone_radius_m: float, tick: int) -> NDArray[np.float32]:
+    def scan(
+        self,
+        poses: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        drone_radius_m: float,
+        tick: int,
+        discs: NDArray[np.float64],
+        edges: NDArray[np.float64],
+        alive: NDArray[np.bool_],
+    ) -> NDArray[np.float32]:
         """Return a turn of every drone's LiDAR, float32 `[worlds, drones, beams]`, taken at `poses` `[..., 3]`.
 
+        `discs` `[worlds, n, 3]` and `edges` `[worlds, m, 4]` are what moves; of radius 0, or all 0, is absent.
+        Drones not `alive` `[worlds, drones]` are not seen, and their own rows are nan.
         Ranges in metres with the sensor's noise; inf no return, nan below the least range.
         """
         ranges = np.empty((self.worlds, self.drones, self.lidar.beams), np.float32)
-        keys = np.array([self._noise_key(world, tick) for world in range(self.worlds)], np.uint64)
+        keys = np.array([self._noise_key(world, tick) for world in self._world_keys], np.uint64)
         if self._geometry is None:
             levels = [level for level in self._levels if level is not None]
             self._geometry = _stack([level.segments for level in levels], [level.circles for level in levels])
         lidar = self.lidar
         self._workers.over(
-            self.worlds, _scan_worlds, ranges, *self._geometry, poses, drone_radius_m,
+            self.worlds, _scan_worlds, ranges, *self._geometry, poses, drone_radius_m, discs, edges, alive,
             (lidar.start, lidar.increment, lidar.range_min, lidar.range_max, lidar.noise_std), keys,
         )  # fmt: skip
         return ranges
@@ -64,8 +80,9 @@ def _stack(segments: list[NDArray[np.float64]], circles: list[NDArray[np.float64
 
 @numba.njit(cache=True, nogil=True)
 def _scan_worlds(  # type: ignore[no-untyped-def]
-    first, last, ranges, segments, segment_counts, circles, circle_counts, poses, drone_radius, lidar, keys
-):
+    first, last, ranges, segments, segment_counts, circles, circle_counts, poses, drone_radius, discs, edges, alive,
+    lidar, keys,
+):  # fmt: skip
     """Fill `ranges` (float32 `[worlds, drones, beams]`) of worlds first to last.
 
     They see the level, the other drones, and noise drawn from the world's key.
@@ -75,22 +92,30 @@ def _scan_worlds(  # type: ignore[no-untyped-def]
     for index in range(first * drones, last * drones):
         world, drone = index // drones, index % drones
         posts = circle_counts[world]
-        round_things = np.empty((posts + drones - 1, 3))
+        round_things = np.empty((posts + drones - 1 + discs.shape[1], 3))
         for post in range(posts):
             for k in range(3):
                 round_things[post, k] = circles[world, post, k]
         count = posts
         for other in range(drones):
-            if other != drone:
+            if other != drone and alive[world, other]:
                 round_things[count, 0], round_things[count, 1] = poses[world, other, 0], poses[world, other, 1]
                 round_things[count, 2] = drone_radius
                 count += 1
+        for disc in range(discs.shape[1]):
+            if discs[world, disc, 2] > 0.0:
+                round_things[count, 0], round_things[count, 1] = discs[world, disc, 0], discs[world, disc, 1]
+                round_things[count, 2] = discs[world, disc, 2]
+                count += 1
+        lines = np.empty((segment_counts[world] + edges.shape[1], 4))
+        for k in range(len(lines)):
+            for i in range(4):
+                fixed = k < segment_counts[world]
+                lines[k, i] = segments[world, k, i] if fixed else edges[world, k - segment_counts[world], i]
         exact = np.empty(beams)
         x, y, yaw = poses[world, drone]
-        cast_rays(
-            exact, segments[world, : segment_counts[world]], round_things, x, y, yaw + start, increment, range_max
-        )
+        cast_rays(exact, lines, round_things[:count], x, y, yaw + start, increment, range_max)
         key = keys[world] * np.uint64(drones) + np.uint64(drone)
         add_noise(exact, key, noise_std, range_min, range_max)
         for beam in range(beams):
-            ranges[world, drone, beam] = exact[beam]
+            ranges[world, drone, beam] = exact[beam] if alive[world, drone] else np.nan

@@ -1,50 +1,45 @@
-"""The twin's physics and sensing: many worlds of drones in one pymunk space, stepped together.
+"""The twin's physics and sensing: many worlds of drones, each in a pymunk space of its own, stepped together.
 
 Each drone is a disc with a velocity controller in front of it: what a setpoint asks for is approached with a lag and
-a limited acceleration, and walls and other drones push back. Worlds lie far apart in the one space, so they cannot
-touch, and positions and velocities move in bulk through `pymunk.batch`.
+a limited acceleration, and walls, crates and other drones push back.
 """
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
+from typing import Any
 
-import numba
 import numpy as np
-import pymunk
-import pymunk.batch
 from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
 from imagine.core.frames import Pose
 from imagine.core.lidar import LD19, LidarSpec
 from imagine.core.vehicle_limits import VehicleLimits
+from imagine.sim.chipmunk import addresses
+from imagine.sim.dynamics import COLUMNS, HISTORY, TICK_S, DynamicsSettings
 from imagine.sim.level import Level
+from imagine.sim.movers import Movers
+from imagine.sim.physics import DRONES, MOVERS, TALLY_COLUMNS, WALLS, prepare_tally, step_worlds, touched
 from imagine.sim.sensing import Sensing
+from imagine.sim.solids import Solids, build_space, free_space
 from imagine.sim.workers import Workers
 
-TICK_S = 0.1
-"""Simulated time of one step: one LiDAR turn."""
-_SUBSTEPS = 5
-_SPACING_M = 256.0  # between worlds; a power of two keeps positions exact to the same last bit in the same row
-_WORLDS_A_ROW = 32
-_MASS_KG = 0.087  # DJI Tello
-_DRONE, _WALL = 1, 2
-_MOTION_FIELDS = pymunk.batch.BodyFields.POSITION | pymunk.batch.BodyFields.VELOCITY
-_ARBITER_FIELDS = (
-    pymunk.batch.ArbiterFields.BODY_A_ID
-    | pymunk.batch.ArbiterFields.BODY_B_ID
-    | pymunk.batch.ArbiterFields.IS_FIRST_CONTACT
-)
+__all__ = ["TICK_S", "Twin"]
 
 
 class Twin:
     """Worlds of drones: poses and velocities `[worlds, drones, 3]`, in metres, radians and seconds, map frame.
 
-    `velocity` holds (vx, vy, yaw rate); `contacts` counts, per drone, the walls and drones it has begun to touch.
+    `velocity` holds (vx, vy, yaw rate). `wall_contacts`, `drone_contacts` and `mover_contacts` count, per drone, how
+    often it began to touch a wall, another drone, and a person or crate; `contacts` is their sum. A drone whose
+    `alive` is set to False has fallen: from the next tick on it lies where it fell, below the LiDARs' plane and out of
+    everyone's way.
     """
 
     dt = TICK_S
+    step_kernel = staticmethod(step_worlds)
 
     def __init__(
         self,
@@ -53,81 +48,140 @@ class Twin:
         lidar: LidarSpec = LD19,
         limits: VehicleLimits | None = None,
         seed: int = 0,
+        dynamics: DynamicsSettings | None = None,
+        world_keys: Sequence[int] | None = None,
     ) -> None:
-        """Make one world for each of `levels`, its drones on the level's launch poses."""
+        """Make one world for each of `levels`, its drones on the level's launch poses.
+
+        All that is random in a world depends on `seed` and its key (default: its index) alone, so world k of a batch
+        flies bit for bit as a twin of one world with `world_keys=[k]`.
+        """
         if not levels or drones < 1:
             raise InputError(f"a twin needs at least one world and one drone, got {len(levels)} and {drones}")
-        self.worlds, self.drones = len(levels), drones
+        worlds = len(levels)
+        self.world_keys = tuple(range(worlds) if world_keys is None else (int(key) for key in world_keys))
+        if len(self.world_keys) != worlds or min(self.world_keys) < 0:
+            raise InputError(f"world keys {self.world_keys}: give one for each of the {worlds} worlds, none negative")
+        self.worlds, self.drones = worlds, drones
         self.lidar = lidar
         self.limits = limits or VehicleLimits()
+        self.dynamics = dynamics or DynamicsSettings()
         self.seed = seed
         self.ticks = 0
         self.workers = Workers()
-        self.poses = np.zeros((self.worlds, drones, 3))
-        self.velocity = np.zeros((self.worlds, drones, 3))
-        self.contacts = np.zeros((self.worlds, drones), np.int64)
+        self.poses = np.zeros((worlds, drones, 3))
+        self.velocity = np.zeros((worlds, drones, 3))
+        self.contacts = np.zeros((worlds, drones), np.int64)
+        self.alive = np.ones((worlds, drones), bool)
+        self.episodes = np.zeros(worlds, np.int64)
+        """Levels set so far in each world: with seed and key it decides what the next one draws."""
         self.levels: list[Level] = list(levels)
-        self._offsets = np.array(
-            [[(w % _WORLDS_A_ROW) * _SPACING_M, (w // _WORLDS_A_ROW) * _SPACING_M] for w in range(self.worlds)]
-        )
-        self._space = pymunk.Space()
-        self._space.iterations = 10
-        self._space.collision_slop = 0.0005  # metres; the default is made for pixels
-        self._space.collision_bias = 1e-15  # half of an overlap is gone after a substep
-        self._statics: list[list[pymunk.Shape]] = [[] for _ in range(self.worlds)]
-        self._bodies = self._make_bodies()
-        self._index_of = {body.id: index for index, body in enumerate(self._bodies)}
-        self._forces = pymunk.batch.Buffer()
-        self._motion = pymunk.batch.Buffer()
-        self._arbiters = pymunk.batch.Buffer()
-        self._sensing = Sensing(self.worlds, drones, lidar, seed, self.workers)
+        self._counts = np.zeros((3, worlds, drones), np.int64)
+        self.wall_contacts, self.drone_contacts = self._counts[WALLS], self._counts[DRONES]
+        self.mover_contacts = self._counts[MOVERS]
+        self._last_touch = np.zeros_like(self._counts)
+        self._ages = np.zeros(worlds, np.int64)
+        self._noise_keys = np.zeros(worlds, np.uint64)
+        self._dynamics = np.zeros((worlds, drones, COLUMNS))
+        self._wind = np.zeros((worlds, drones, 2))
+        self._history = np.zeros((worlds, drones, HISTORY, 3))
+        self._movers = Movers.none(worlds)
+        self._api = addresses()
+        self._bodies = np.zeros((worlds, drones), np.int64)
+        self._shapes = np.zeros((worlds, drones), np.int64)
+        self._present = np.ones((worlds, drones), bool)
+        self._tally = np.zeros((worlds, 3, TALLY_COLUMNS), np.int64)
+        self._spaces = np.zeros(worlds, np.int64)
+        self._walkers = np.zeros((worlds, 0), np.int64)
+        self._boxes = np.zeros((worlds, 0), np.int64)
+        self._arguments: tuple[Any, ...] | None = None
+        self._solids: weakref.WeakKeyDictionary[Level, Solids] = weakref.WeakKeyDictionary()
+        self._owned: dict[int, tuple[int, NDArray[np.int64], NDArray[np.int64]]] = {}
+        weakref.finalize(self, _free_all, self._api, self._owned).atexit = False  # the process's end frees it all
+        self._sensing = Sensing(worlds, drones, lidar, seed, self.workers, self.world_keys)
         for world, level in enumerate(levels):
             self.set_level(world, level, level.launch_poses(drones))
 
-    def _make_bodies(self) -> list[pymunk.Body]:
-        bodies = []
-        for _ in range(self.worlds * self.drones):
-            body = pymunk.Body(_MASS_KG, float("inf"))  # yaw is not the solver's: discs without friction never turn
-            disc = pymunk.Circle(body, self.limits.radius_m)
-            disc.friction, disc.elasticity, disc.collision_type = 0.0, 0.0, _DRONE
-            self._space.add(body, disc)
-            bodies.append(body)
-        return bodies
+    @property
+    def mover_discs(self) -> NDArray[np.float64]:
+        """The people that LiDARs see, float64 `[worlds, n, 3]` (x, y, radius), metres; radius 0 is nobody."""
+        return self._movers.discs
+
+    @property
+    def mover_edges(self) -> NDArray[np.float64]:
+        """The crates' edges that LiDARs see, float64 `[worlds, m, 4]` (x0, y0, x1, y1), metres; all 0 is none."""
+        return self._movers.edges
+
+    @property
+    def wind(self) -> NDArray[np.float64]:
+        """How the air moves at each drone, float64 `[worlds, drones, 2]`, m/s, map frame."""
+        return self._wind
+
+    @property
+    def drawn_dynamics(self) -> NDArray[np.float64]:
+        """This episode's dynamics of every drone, float64 `[worlds, drones, COLUMNS]` of `sim/dynamics.py`."""
+        return self._dynamics
 
     def set_level(self, world: int, level: Level, poses: Sequence[Pose]) -> None:
-        """Put a world's drones at rest at `poses` in another (or the same) level."""
+        """Begin an episode in a world: drones at rest at `poses`, alive, in another (or the same) level."""
         if len(poses) != self.drones:
             raise InputError(f"level {level.name}: {len(poses)} launch poses for {self.drones} drones")
-        self._space.remove(*self._statics[world])
-        offset_x, offset_y = self._offsets[world]
-        ground = self._space.static_body
-        shapes: list[pymunk.Shape] = []
-        loop = [(x + offset_x, y + offset_y) for x, y in level.outline]
-        for a, b in zip(loop, [*loop[1:], loop[0]], strict=True):
-            shapes.append(pymunk.Segment(ground, a, b, 0.0))
-        for polygon in level.polygons:
-            shapes.append(pymunk.Poly(ground, [(x + offset_x, y + offset_y) for x, y in polygon]))
-        for x, y, radius in level.circles:
-            shapes.append(pymunk.Circle(ground, radius, (x + offset_x, y + offset_y)))
-        for shape in shapes:
-            shape.friction, shape.elasticity, shape.collision_type = 0.0, 0.0, _WALL
-        self._space.add(*shapes)
-        self._statics[world] = shapes
+        words = [self.seed % 2**64, self.world_keys[world], int(self.episodes[world])]
+        rng = np.random.default_rng(words)
+        self.episodes[world] += 1
+        self._dynamics[world] = self.dynamics.draw(rng, self.drones, self.limits)
+        self._noise_keys[world] = rng.integers(2**64, dtype=np.uint64)
+        if self._movers.make_room(level):
+            self._walkers = _widened(self._walkers, self._movers.people.shape[1])
+            self._boxes = _widened(self._boxes, self._movers.crates.shape[1])
+            self._arguments = None
+        self._movers.place(world, level, rng, poses, self.limits.radius_m)
         self.levels[world] = level
         self._sensing.set_level(world, level)
         self.poses[world] = poses
         self.velocity[world] = 0.0
         self.contacts[world] = 0
-        for drone, pose in enumerate(poses):
-            body = self._bodies[world * self.drones + drone]
-            body.position = (pose.x + offset_x, pose.y + offset_y)
-            body.velocity = (0.0, 0.0)
+        self.alive[world] = self._present[world] = True
+        self._ages[world] = 0
+        self._wind[world] = 0.0
+        self._history[world] = 0.0
+        self._build(world, level)
 
-    def step(self, setpoints: NDArray[np.float64]) -> None:
-        """Fly one tick with body-frame velocity setpoints `[worlds, drones, 3]` (forward, left, yaw rate).
+    def _build(self, world: int, level: Level) -> None:
+        """Put a world's walls, drones and movers into a new space."""
+        solids = self._solids.get(level)
+        if solids is None:
+            solids = self._solids[level] = Solids.of(level)
+        if world in self._owned:
+            free_space(self._api, *self._owned.pop(world))
+        prepare_tally(self._api, world, self._tally, self._bodies, self._counts, self._last_touch)
+        self._owned[world] = build_space(
+            self._api, solids.segments, solids.vertices, solids.starts, solids.posts, self.poses[world],
+            self._dynamics[world], self.limits.radius_m, self._movers.people[world], self._movers.crates[world],
+            touched.address, self._tally[world], self._bodies[world], self._shapes[world], self._walkers[world],
+            self._boxes[world],
+        )  # fmt: skip
+        self._spaces[world] = self._owned[world][0]
 
-        Setpoints past the limits are cut to them. Raises InputError naming world and drone where one is not finite.
+    def kernel_args(self) -> tuple[Any, ...]:
+        """Return what `step_kernel(first, last, setpoints, *kernel_args())` takes, for kernels that fuse several steps.
+
+        Ask anew in every tick, since a level with more people or crates than any before brings larger arrays; and count
+        `ticks` up yourself.
         """
+        if self._arguments is None:
+            limits, movers = self.limits, self._movers
+            self._arguments = (
+                self._api, self._spaces, self._bodies, self._shapes, self._tally, self._counts, self._last_touch,
+                self.contacts, self._ages, self._noise_keys, self.poses, self.velocity, self.alive, self._present,
+                self._dynamics, self._wind, self._history, (limits.speed_mps, limits.yaw_rate_rps, limits.radius_m),
+                movers.loops, movers.walks, movers.people, self._walkers, movers.crates, self._boxes, movers.discs,
+                movers.edges,
+            )  # fmt: skip
+        return self._arguments
+
+    def check(self, setpoints: NDArray[np.float64]) -> None:
+        """Raise InputError naming level, drone and place where a setpoint `[worlds, drones, 3]` is not finite."""
         if not np.isfinite(setpoints).all():
             world, drone, _ = np.argwhere(~np.isfinite(setpoints))[0]
             level, pose = self.levels[world], self.poses[world, drone]
@@ -135,67 +189,36 @@ class Twin:
                 f"level {level.name}: setpoint {setpoints[world, drone]} of drone {drone} in world {world}, "
                 f"at ({pose[0]:.2f}, {pose[1]:.2f}), is not finite"
             )
-        count = self.worlds * self.drones
-        yaw = self.poses[..., 2].reshape(-1)
-        velocity = self.velocity.reshape(-1, 3)
-        forces = np.zeros((count + 1, 2))  # the space lists its static body after the drones
-        limits = self.limits
-        dt = TICK_S / _SUBSTEPS
-        for _ in range(_SUBSTEPS):
-            # Forces, not velocities: the solver then stops what pushes into a wall before positions move.
-            _control(
-                forces, velocity, yaw, setpoints.reshape(-1, 3), dt,
-                limits.lag_s, limits.acceleration_mps2, limits.speed_mps, limits.yaw_rate_rps,
-            )  # fmt: skip
-            self._forces.set_float_buf(forces)
-            pymunk.batch.set_space_bodies(self._space, pymunk.batch.BodyFields.FORCE, self._forces)
-            self._space.step(dt)
-            self._motion.clear()
-            pymunk.batch.get_space_bodies(self._space, _MOTION_FIELDS, self._motion)
-            state = np.frombuffer(self._motion.float_buf(), np.float64).reshape(-1, 4)[:count]
-            velocity[:, :2] = state[:, 2:]
-            self._count_contacts()
-        offsets = np.repeat(self._offsets, self.drones, axis=0)
-        self.poses[..., :2] = (state[:, :2] - offsets).reshape(self.worlds, self.drones, 2)
-        self.poses[..., 2] = np.remainder(yaw + np.pi, 2.0 * np.pi).reshape(self.worlds, self.drones) - np.pi
-        self.velocity[...] = velocity.reshape(self.velocity.shape)
+
+    def step(self, setpoints: NDArray[np.float64]) -> None:
+        """Fly one tick with body-frame velocity setpoints `[worlds, drones, 3]` (forward, left, yaw rate).
+
+        Setpoints past the limits are cut to them. Raises InputError naming world and drone where one is not finite.
+        """
+        self.check(setpoints)
+        wanted = np.ascontiguousarray(setpoints, np.float64)
+        self.workers.over(self.worlds, step_worlds, wanted, *self.kernel_args())
         self.ticks += 1
 
-    def _count_contacts(self) -> None:
-        self._arbiters.clear()
-        pymunk.batch.get_space_arbiters(self._space, _ARBITER_FIELDS, self._arbiters)
-        entries = np.frombuffer(bytes(self._arbiters.int_buf()), np.uint64).reshape(-1, 3)
-        for a, b, first in entries:
-            if first:
-                for body in (int(a), int(b)):
-                    index = self._index_of.get(body)
-                    if index is not None:
-                        self.contacts[index // self.drones, index % self.drones] += 1
-
     def scan(self) -> NDArray[np.float32]:
-        """Return a turn of every drone's LiDAR, float32 `[worlds, drones, beams]`: walls, posts and other drones.
+        """Return a turn of every drone's LiDAR, float32 `[worlds, drones, beams]`: all that stands or moves about it.
 
-        Ranges in metres with the sensor's noise; inf no return, nan below the least range.
+        Ranges in metres with the sensor's noise; inf no return, nan below the least range. Fallen drones are not seen,
+        and their own rows are nan.
         """
-        return self._sensing.scan(self.poses, self.limits.radius_m, self.ticks)
+        return self._sensing.scan(
+            self.poses, self.velocity, self.limits.radius_m, self.ticks, self.mover_discs, self.mover_edges,
+            alive=self.alive,
+        )  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True)
-def _control(forces, velocity, yaw, wanted, dt, lag, acceleration, speed, fastest_yaw):  # type: ignore[no-untyped-def]
-    """Write the forces (N, `[n, 2]`) that move velocities toward body setpoints `[n, 3]`, and turn the headings."""
-    blend = 1.0 - np.exp(-dt / lag) if lag > 0.0 else 1.0
-    for k in range(len(velocity)):
-        forward, left = wanted[k, 0], wanted[k, 1]
-        size = np.sqrt(forward * forward + left * left)
-        if size > speed:
-            forward, left = forward * speed / size, left * speed / size
-        c, s = np.cos(yaw[k]), np.sin(yaw[k])
-        ax = (c * forward - s * left - velocity[k, 0]) * blend / dt
-        ay = (s * forward + c * left - velocity[k, 1]) * blend / dt
-        size = np.sqrt(ax * ax + ay * ay)
-        if size > acceleration:
-            ax, ay = ax * acceleration / size, ay * acceleration / size
-        forces[k, 0], forces[k, 1] = _MASS_KG * ax, _MASS_KG * ay
-        rate = min(max(wanted[k, 2], -fastest_yaw), fastest_yaw)
-        velocity[k, 2] += (rate - velocity[k, 2]) * blend
-        yaw[k] += velocity[k, 2] * dt
+def _widened(array: NDArray[np.int64], columns: int) -> NDArray[np.int64]:
+    grown = np.zeros((len(array), columns), np.int64)
+    grown[:, : array.shape[1]] = array
+    return grown
+
+
+def _free_all(api: NDArray[np.int64], owned: dict[int, tuple[int, NDArray[np.int64], NDArray[np.int64]]]) -> None:
+    for space, shapes, bodies in owned.values():
+        free_space(api, space, shapes, bodies)
+    owned.clear()
