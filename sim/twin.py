@@ -177,7 +177,7 @@ class Twin:
 
         Ranges in metres with the sensor's noise; inf no return, nan below the least range.
         """
-        return self._sensing.scan(self.poses, self.limits.radius_m, self.ticks)
+        return self._sensing.scan(self.poses, self.velocity, self.limits.radius_m, self.ticks)
 
 
 @numba.njit(cache=True, nogil=True)
