@@ -80,16 +80,25 @@ def facing_edges(level: Level) -> NDArray[np.float64]:
 def _build(edges: NDArray[np.float64], circles: NDArray[np.float64], reach_m: float) -> LevelIndex:
     points = np.concatenate((edges[:, :2], edges[:, 2:]))
     low, high = points.min(axis=0), points.max(axis=0)
-    side = _SQUARE_M
+    side, total = _SQUARE_M, len(edges) + len(circles)
+    nothing = np.empty(0, np.int64), np.empty(0)
     while True:
         columns, rows = (max(1, math.ceil(extent / side)) for extent in high - low)
-        starts = _count_items(edges, circles, low[0], low[1], side, rows, columns, reach_m)
-        if starts[-1] <= _MOST_ITEMS or rows * columns == 1:
+        floor = (low[0], low[1], side, rows, columns)
+        counts = np.zeros(rows * columns, np.int64)
+        _visit(counts, *nothing, edges, circles, floor, reach_m, False)
+        if counts.sum() <= _MOST_ITEMS or rows * columns == 1:
             break
         side *= 2.0
-    items, nearest = _list_items(edges, circles, low[0], low[1], side, rows, columns, reach_m, starts)
+    starts = np.concatenate(([0], np.cumsum(counts), [counts.sum() + total]))
+    items, distances = np.arange(starts[-1]) - starts[-2], np.zeros(starts[-1])  # the last list holds everything
+    _visit(starts[:-2].copy(), items, distances, edges, circles, floor, reach_m, True)
+    order = np.lexsort((distances, np.repeat(np.arange(rows * columns + 1), np.diff(starts))))
+    nearest = np.maximum(distances[order] - 1e-5, 0.0).astype(np.float32)  # so that rounding does not raise it
     corner = float(low[0]), float(low[1])
-    return LevelIndex(edges, circles, corner, side, (rows, columns), starts.astype(np.int32), items, nearest)
+    return LevelIndex(
+        edges, circles, corner, side, (rows, columns), starts.astype(np.int32), items[order].astype(np.int32), nearest
+    )
 
 
 @numba.njit(cache=True, nogil=True)
@@ -110,84 +119,35 @@ def _crosses_itself(loop):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _nearest_edge(edge, x, y, half):  # type: ignore[no-untyped-def]
-    """Return how near an edge can be to a point of the square around (x, y), inf if it faces none; metres."""
-    ax, ay, ex, ey = edge[0] - x, edge[1] - y, edge[2] - edge[0], edge[3] - edge[1]
-    if ax * ey - ay * ex + half * (abs(ex) + abs(ey)) < 0.0:  # linear in the place: greatest at a corner
-        return np.inf
-    length_squared = ex * ex + ey * ey
-    t = min(max(-(ax * ex + ay * ey) / length_squared, 0.0), 1.0) if length_squared > 0.0 else 0.0
-    return max(0.0, math.hypot(ax + t * ex, ay + t * ey) - half * math.sqrt(2.0))
-
-
-@numba.njit(cache=True, nogil=True)
-def _nearest_item(edges, circles, item, x, y, half):  # type: ignore[no-untyped-def]
-    if item < len(edges):
-        return _nearest_edge(edges[item], x, y, half)
-    circle = circles[item - len(edges)]
-    return max(0.0, math.hypot(circle[0] - x, circle[1] - y) - circle[2] - half * math.sqrt(2.0))
-
-
-@numba.njit(cache=True, nogil=True)
-def _squares_around(edges, circles, item, x0, y0, side, rows, columns, reach):  # type: ignore[no-untyped-def]
-    """Return first and last row and column of the squares that an item can be in reach of."""
-    if item < len(edges):
-        ax, ay, bx, by = edges[item]
-        grow = reach
-    else:
-        ax, ay, grow = circles[item - len(edges)]
-        bx, by = ax, ay
-        grow += reach
-    return (
-        max(0, math.floor((min(ay, by) - grow - y0) / side)),
-        min(rows - 1, math.floor((max(ay, by) + grow - y0) / side)),
-        max(0, math.floor((min(ax, bx) - grow - x0) / side)),
-        min(columns - 1, math.floor((max(ax, bx) + grow - x0) / side)),
-    )
-
-
-@numba.njit(cache=True, nogil=True)
-def _count_items(edges, circles, x0, y0, side, rows, columns, reach):  # type: ignore[no-untyped-def]
-    """Return the begins of the lists, int32 `[squares + 2]`."""
-    squares, total = rows * columns, len(edges) + len(circles)
-    counts = np.zeros(squares + 2, np.int64)
+def _visit(ends, items, distances, edges, circles, floor, reach, listing):  # type: ignore[no-untyped-def]
+    """Raise `ends` of each square for every item in reach of it; when `listing`, also write the item there."""
+    x0, y0, side, rows, columns = floor
     half = 0.5 * side * (1.0 + 1e-9)  # a hair more, for rounding
-    for item in range(total):
-        row0, row1, column0, column1 = _squares_around(edges, circles, item, x0, y0, side, rows, columns, reach)
-        for row in range(row0, row1 + 1):
-            for column in range(column0, column1 + 1):
-                x, y = x0 + (column + 0.5) * side, y0 + (row + 0.5) * side
-                if _nearest_item(edges, circles, item, x, y, half) <= reach:
-                    counts[row * columns + column + 1] += 1
-    counts[squares + 1] = total
-    return np.cumsum(counts)
-
-
-@numba.njit(cache=True, nogil=True)
-def _list_items(edges, circles, x0, y0, side, rows, columns, reach, starts):  # type: ignore[no-untyped-def]
-    """Return the lists, nearest first, and the distances; the last list holds everything."""
-    squares, total = rows * columns, len(edges) + len(circles)
-    items, distances = np.zeros(starts[-1], np.int32), np.zeros(starts[-1], np.float64)
-    ends = starts[:-1].copy()
-    half = 0.5 * side * (1.0 + 1e-9)
-    for item in range(total):
-        row0, row1, column0, column1 = _squares_around(edges, circles, item, x0, y0, side, rows, columns, reach)
-        for row in range(row0, row1 + 1):
-            for column in range(column0, column1 + 1):
-                x, y = x0 + (column + 0.5) * side, y0 + (row + 0.5) * side
-                distance = _nearest_item(edges, circles, item, x, y, half)
+    for item in range(len(edges) + len(circles)):
+        if item < len(edges):
+            ax, ay, bx, by = edges[item]
+            radius = 0.0
+        else:
+            ax, ay, radius = circles[item - len(edges)]
+            bx, by = ax, ay
+        ex, ey = bx - ax, by - ay
+        length_squared = ex * ex + ey * ey
+        grow = reach + radius
+        low_row, low_column = (min(ay, by) - grow - y0) / side, (min(ax, bx) - grow - x0) / side
+        high_row, high_column = (max(ay, by) + grow - y0) / side, (max(ax, bx) + grow - x0) / side
+        for row in range(max(0, math.floor(low_row)), min(rows, math.floor(high_row) + 1)):
+            for column in range(max(0, math.floor(low_column)), min(columns, math.floor(high_column) + 1)):
+                px, py = ax - x0 - (column + 0.5) * side, ay - y0 - (row + 0.5) * side
+                if px * ey - py * ex + half * (abs(ex) + abs(ey)) < 0.0:  # greatest at one of the square's corners
+                    continue
+                t = min(max(-(px * ex + py * ey) / length_squared, 0.0), 1.0) if length_squared > 0.0 else 0.0
+                px, py = px + t * ex, py + t * ey
+                distance = max(0.0, math.sqrt(px * px + py * py) - radius - half * math.sqrt(2.0))
                 if distance <= reach:
-                    at = ends[row * columns + column]
-                    items[at], distances[at] = item, distance
-                    ends[row * columns + column] += 1
-        items[starts[squares] + item] = item
-    nearest = np.zeros(starts[-1], np.float32)
-    for k in range(squares):
-        order = np.argsort(distances[starts[k] : starts[k + 1]])
-        items[starts[k] : starts[k + 1]] = items[starts[k] : starts[k + 1]][order]
-        for i in range(len(order)):
-            nearest[starts[k] + i] = max(0.0, distances[starts[k] + order[i]] - 1e-5)  # rounding must not raise it
-    return items, nearest
+                    square = row * columns + column
+                    if listing:
+                        items[ends[square]], distances[ends[square]] = item, distance
+                    ends[square] += 1
 
 
 class LevelArrays(NamedTuple):

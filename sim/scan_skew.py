@@ -65,15 +65,16 @@ def draw_moving(  # type: ignore[no-untyped-def]
             else:
                 circle = levels.circles[row, item - first_circle]
                 _draw_disc(inverse, rays, circle[0] - x, circle[1] - y, circle[2], fan)
-    for k in range(len(discs)):
-        _draw_disc(inverse, rays, discs[k, 0] - x, discs[k, 1] - y, discs[k, 2], fan)
-    for other in range(len(poses)):
-        if other != drone and alive[other]:
+    for k in range(len(discs) + len(poses)):
+        other = k - len(discs)
+        if other < 0:
+            _draw_disc(inverse, rays, discs[k, 0] - x, discs[k, 1] - y, discs[k, 2], fan)
+        elif other != drone and alive[other]:
             _draw_disc(inverse, rays, poses[other, 0] - x, poses[other, 1] - y, drone_radius, fan)
-    for k in range(len(edges)):
-        ax, ay, bx, by = edges[k, 0] - x, edges[k, 1] - y, edges[k, 2] - x, edges[k, 3] - y
-        _draw_edge(inverse, rays, ax, ay, bx, by, fan)
-        _draw_edge(inverse, rays, bx, by, ax, ay, fan)
+    for k in range(2 * len(edges)):  # of loops that turn either way, so they are seen from both sides
+        a, b = (0, 2) if k % 2 == 0 else (2, 0)
+        edge = edges[k // 2]
+        _draw_edge(inverse, rays, edge[a] - x, edge[a + 1] - y, edge[b] - x, edge[b + 1] - y, fan)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

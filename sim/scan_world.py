@@ -89,7 +89,7 @@ def _look_around(  # type: ignore[no-untyped-def]
     x, y = poses[drone, 0], poses[drone, 1]
     c, s = math.cos(heading), math.sin(heading)
     first_circle, square = levels.shape[row, 2], square_of(levels, row, x, y)
-    count = 0
+    count = np.int64(0)  # typed: a literal would have everything below compiled twice
     for at in range(levels.starts[row, square], levels.starts[row, square + 1]):
         if levels.nearest[row, at] > limit:
             break
@@ -102,11 +102,15 @@ def _look_around(  # type: ignore[no-untyped-def]
         else:
             circle = levels.circles[row, item - first_circle]
             count = _add_near_disc(sight, count, circle[0] - x, circle[1] - y, circle[2], limit, c, s)
-    for k in range(len(discs)):
-        count = _add_near_disc(sight, count, discs[k, 0] - x, discs[k, 1] - y, discs[k, 2], limit, c, s)
-    for other in range(len(poses)):
-        if other != drone and alive[other]:
-            count = _add_near_disc(sight, count, poses[other, 0] - x, poses[other, 1] - y, drone_radius, limit, c, s)
+    for k in range(len(discs) + len(poses)):
+        other = k - len(discs)
+        if other < 0:
+            cx, cy, radius = discs[k, 0], discs[k, 1], discs[k, 2]
+        elif other != drone and alive[other]:
+            cx, cy, radius = poses[other, 0], poses[other, 1], drone_radius
+        else:
+            continue
+        count = _add_near_disc(sight, count, cx - x, cy - y, radius, limit, c, s)
     for k in range(len(edges)):  # of loops that turn either way, so they are seen from both sides
         ax, ay, bx, by = edges[k, 0] - x, edges[k, 1] - y, edges[k, 2] - x, edges[k, 3] - y
         if ax * by - ay * bx < 0.0:

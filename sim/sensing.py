@@ -32,8 +32,8 @@ class Sensing:
         lidar: LidarSpec,
         seed: int,
         workers: Workers,
-        model: LidarModel | None = None,
         world_keys: Sequence[int] | NDArray[np.int64] | None = None,
+        model: LidarModel | None = None,
     ) -> None:
         """Prepare the sensors; give each world its level before the first scan.
 
