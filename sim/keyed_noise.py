@@ -48,5 +48,13 @@ def key_of(key, number):  # type: ignore[no-untyped-def]
 
 def root_keys(seed: int, worlds: NDArray[np.int64]) -> NDArray[np.uint64]:
     """Return the keys, uint64 `[worlds]`, that all noise of worlds with these numbers is drawn from."""
-    root = scramble(np.uint64(seed % 2**64))
-    return np.array([key_of(root, np.int64(world)) for world in worlds], np.uint64)
+    keys: NDArray[np.uint64] = _root_keys(np.uint64(seed % 2**64), np.asarray(worlds, np.int64))
+    return keys
+
+
+@numba.njit(cache=True, nogil=True)
+def _root_keys(seed, worlds):  # type: ignore[no-untyped-def]
+    keys = np.empty(len(worlds), np.uint64)
+    for k in range(len(worlds)):
+        keys[k] = key_of(scramble(seed), worlds[k])
+    return keys

@@ -103,11 +103,12 @@ class Sensing:
         """
         ranges = np.empty((self.worlds, self.drones, self.lidar.beams), np.float32)
         everybody, no_discs, no_edges = self._absent
-        self._workers.over(
-            self.worlds, scan_worlds, ranges, self.sensors(reach_m), poses, velocity,
-            everybody if alive is None else alive, no_discs if discs is None else discs,
-            no_edges if edges is None else edges, drone_radius_m, tick,
+        parts = (
+            poses, velocity, everybody if alive is None else alive, no_discs if discs is None else discs,
+            no_edges if edges is None else edges,
         )  # fmt: skip
+        whole = (np.ascontiguousarray(part) for part in parts)  # kernels are compiled for one layout
+        self._workers.over(self.worlds, scan_worlds, ranges, self.sensors(reach_m), *whole, drone_radius_m, tick)
         return ranges
 
     def _index(self, limit_m: float) -> None:
