@@ -53,7 +53,21 @@ class LidarSpec:
 LD19 = LidarSpec(beams=360)
 """The reference sensor: LDRobot LD19 class, 360 beams over 360 degrees, 0.05-12 m, 10 Hz."""
 
-PRESETS: dict[str, LidarSpec] = {"ld19": LD19}
+RING72 = LidarSpec(beams=72, range_min=0.1, range_max=8.0, noise_std=0.03)
+"""A low-cost ring: 5 degrees a beam, as MAVLink's OBSTACLE_DISTANCE carries what surrounds a drone (72 distances)."""
+
+RANGER4 = LidarSpec(beams=4, range_min=0.04, range_max=4.0, noise_std=0.02)
+"""Four rangers, front, left, back and right, as on Bitcraze's Multi-ranger deck: ST VL53L1X (DocID031281: up to 4 m, 50
+Hz; within 20 mm; none under 40 mm). Their cones of 27 degrees are taken as single beams; at our 10 Hz."""
+
+_URG_STEP = 2.0 * math.pi / 1024.0
+URG04LX = LidarSpec(
+    beams=682, fov=682 * _URG_STEP, range_min=0.02, range_max=5.6, noise_std=0.01, start=-340 * _URG_STEP
+)
+"""Hokuyo URG-04LX class, blind behind: steps 44 to 725 of 1024 a turn, front at 384 (240 degrees), 0.02-5.6 m, 10 Hz
+(SCIP 2.0 manual C-42-03320B; within 30 mm up to 1 m, 3 % beyond)."""
+
+PRESETS: dict[str, LidarSpec] = {"ld19": LD19, "ring72": RING72, "ranger4": RANGER4, "urg04lx": URG04LX}
 
 
 TEAMMATE_RADIUS_M = 0.25
