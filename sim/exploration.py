@@ -146,6 +146,11 @@ class Exploration:
             active,
         )
 
+    @property
+    def ranges(self) -> NDArray[np.float32]:
+        """The newest turn of every drone's LiDAR, `[worlds, drones, beams]`: metres, inf no return, nan invalid."""
+        return self._ranges
+
     def links(self) -> NDArray[np.bool_]:
         """Tell which drones hear which now, bool `[worlds, drones, drones]`: a disc, the diagonal left out."""
         if self.settings.protocol == "off":

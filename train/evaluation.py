@@ -53,7 +53,7 @@ def evaluate(
     what comes next; `film` takes the first episode of the first row.
     """
     base = env or (policy.env if isinstance(policy, Policy) else None) or ExplorationSettings()
-    rows = []
+    rows: list[dict[str, Any]] = []
     for level in levels:
         for count in drones:
             if progress is not None:

@@ -135,7 +135,13 @@ def one_tick(end: EpisodeTotals) -> EpisodeMetrics:
 
 def test_counters_that_nobody_keeps_are_none_and_not_zero() -> None:
     told = one_tick(totals([1, 2], contacts=np.array([3, 4])))
-    assert (told.contacts, told.contacts_by, told.bytes_by, told.total_bytes, told.cells_by) == (7, None, None, None, None)
+    assert (told.contacts, told.contacts_by, told.bytes_by, told.total_bytes, told.cells_by) == (
+        7,
+        None,
+        None,
+        None,
+        None,
+    )
     contacts, sent, cells = np.arange(6).reshape(2, 3), np.arange(8).reshape(2, 4), np.arange(6).reshape(2, 3) + 9
     told = one_tick(totals([1, 2], contacts=contacts, bytes_by=sent, cells_by=cells))
     assert (told.contacts, told.total_bytes) == (15, 28)
