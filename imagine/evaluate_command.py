@@ -17,9 +17,9 @@ from imagine.train.atomic_file import write_atomically
 from imagine.train.evaluation import evaluate, named_policy
 
 _SHOWN = {
-    "level": "level", "drones": "drones", "coverage_mean": "seen", "t90_mean": "T90", "t90_reached": "T90 reached",
-    "t95_mean": "T95", "t99_mean": "T99", "collisions_per_episode": "contacts", "path_m": "path, m",
-    "bytes_per_drone": "bytes a drone", "link_share": "linked", "productivity_ratio": "most / least",
+    "level": "level", "drones": "drones", "coverage_mean": "seen", "t90_mean": "T90", "t90_reached": "T90\nreached",
+    "t95_mean": "T95", "t99_mean": "T99", "collisions_per_episode": "contacts", "path_m": "path,\nm",
+    "bytes_per_drone": "bytes\na drone", "link_share": "linked", "productivity_ratio": "most /\nleast",
 }  # fmt: skip
 """Keys of a row that the table shows, and how it names them."""
 
