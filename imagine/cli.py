@@ -224,14 +224,15 @@ def evaluate(
     protocol: Annotated[str, typer.Option(help="off, one-hop or multi-hop")] = "one-hop",
     episodes: Annotated[int, typer.Option(min=1)] = 20,
     seed: Annotated[int, typer.Option(min=0)] = 0,
+    film: Annotated[Path | None, typer.Option(metavar="FILE.gif|FILE.mp4", help="film the first episode")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Measure a policy in the batched twin: coverage, time to 90%, contacts, bytes."""
     _needs("torch", "train")
-    check_outputs(json_file)
+    check_outputs(json_file, film_file=film)
     from imagine.evaluate_command import evaluate_and_show
 
-    evaluate_and_show(policy, levels, drones, _protocol(protocol), episodes, seed, json_file)
+    evaluate_and_show(policy, levels, drones, _protocol(protocol), episodes, seed, json_file, film)
 
 
 @export_app.command("onnx")

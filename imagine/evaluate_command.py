@@ -12,30 +12,58 @@ from imagine.core.errors import InputError
 from imagine.mesh_comm.settings import Protocol
 from imagine.onboard.settings import DEFAULT_POLICY
 from imagine.outputs import write_json
+from imagine.sim.film import Film
+from imagine.train.atomic_file import write_atomically
 from imagine.train.evaluation import evaluate, named_policy
 
-_SHOWN = (
-    "level", "drones", "coverage_mean", "t90_mean", "t90_reached", "t95_mean", "collisions_per_episode", "path_m",
-)  # fmt: skip
+_SHOWN = {
+    "level": "level", "drones": "drones", "coverage_mean": "seen", "t90_mean": "T90", "t90_reached": "T90\nreached",
+    "t95_mean": "T95", "t99_mean": "T99", "collisions_per_episode": "contacts", "path_m": "path,\nm",
+    "bytes_per_drone": "bytes\na drone", "link_share": "linked", "productivity_ratio": "most /\nleast",
+}  # fmt: skip
+"""Keys of a row that the table shows, and how it names them."""
 
 
 def evaluate_and_show(
-    policy: str, levels: str, drones: str, protocol: Protocol, episodes: int, seed: int, json_file: Path | None
+    policy: str,
+    levels: str,
+    drones: str,
+    protocol: Protocol,
+    episodes: int,
+    seed: int,
+    json_file: Path | None,
+    film_file: Path | None = None,
 ) -> None:
-    """Measure a policy (empty: the shipped one) and print a row per level and team size."""
+    """Measure a policy (empty: the shipped one), print a row per level and team size, film the first episode.
+
+    Raises WorkError where the film cannot be written in the end; see `outputs.check_outputs` for before.
+    """
     chosen_levels, sizes = level_list(levels), team_sizes(drones)
     chosen = named_policy(policy or str(DEFAULT_POLICY))
+    film = None if film_file is None else Film()
     rows = evaluate(
         chosen, chosen_levels, sizes, protocol, episodes, seed,
-        progress=lambda text: print(text, file=sys.stderr),
+        progress=lambda text: print(text, file=sys.stderr), film=film,
     )  # fmt: skip
-    table = Table(title=f"{policy or 'shipped policy'}, {protocol}, {episodes} episodes each")
-    for name in _SHOWN:
-        table.add_column(name, justify="right")
+    title = f"{policy or 'shipped policy'}, {protocol}, {episodes} episodes each"
+    table = Table(title=title, box=None, padding=(0, 1, 0, 0))  # so that it fits into 80 columns
+    for heading in _SHOWN.values():
+        table.add_column(heading, justify="right")
     for row in rows:
-        table.add_row(*(f"{row[name]:.3g}" if isinstance(row[name], float) else str(row[name]) for name in _SHOWN))
+        table.add_row(*(_cell(row[name]) for name in _SHOWN))
     Console().print(table)
     write_json(json_file, rows)
+    if film is not None and film_file is not None:
+        encoded = film.encode(film_file.suffix)
+        write_atomically(film_file, lambda temporary: temporary.write_bytes(encoded))
+        print(f"{film_file}: {len(film)} pictures, {len(encoded) / 1e6:.2f} MB", file=sys.stderr)
+
+
+def _cell(value: object) -> str:
+    """Return a number with three figures, thousands in full."""
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
+    return str(value)
 
 
 def level_list(text: str) -> list[str]:

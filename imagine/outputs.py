@@ -10,11 +10,15 @@ from typing import Any
 from imagine.core.errors import InputError
 
 
-def check_outputs(json_file: Path | None, map_file: Path | None = None) -> None:
-    """Raise InputError naming a file that cannot be written; `map_file` needs to be a PNG."""
+def check_outputs(json_file: Path | None, map_file: Path | None = None, film_file: Path | None = None) -> None:
+    """Raise InputError naming a file that cannot be written; `map_file` needs to be a PNG, `film_file` GIF or MP4."""
     if map_file is not None and map_file.suffix.lower() != ".png":
         raise InputError(f"--map {map_file}: the map is drawn as PNG: name a file that ends in .png")
-    for path in (json_file, map_file):
+    if film_file is not None:
+        from imagine.sim.film import check_film
+
+        check_film(film_file)
+    for path in (json_file, map_file, film_file):
         if path is None:
             continue
         if path.is_dir():

@@ -21,6 +21,7 @@ from imagine.sim.decision_state import DecisionState
 from imagine.sim.exploration_kernels import fill_critic, fill_observations, shielded_setpoints
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.level import Level, load_level, mirrored
+from imagine.sim.metrics import EpisodeMetrics, EpisodeTotals, Recorder
 from imagine.sim.team_maps import TeamMaps
 from imagine.sim.twin import TICK_S, Twin
 
@@ -34,25 +35,6 @@ class Observation:
 
     policy: dict[str, NDArray[np.float32]]
     critic: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class EpisodeMetrics:
-    """One finished episode. Ticks of T90 and T95 are None where never reached; distances in metres."""
-
-    world: int
-    level: str
-    ticks: int
-    coverage: float
-    curve: NDArray[np.float32]
-    t90: int | None
-    t95: int | None
-    contacts: int
-    path_m: NDArray[np.float64]
-    discovered: NDArray[np.int64]
-    tiles_sent: NDArray[np.int64]
-    overlap: float
-    """Cells known by their own sensors, summed over drones, per cell the team has seen: 1 is no overlap."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +76,8 @@ class Exploration:
         self.ticks = np.zeros(self.worlds, np.int64)
         self._idle = np.zeros(self.worlds, np.int64)
         self._limit = np.full(self.worlds, settings.episode_ticks)
-        self._curves: list[list[float]] = [[] for _ in range(self.worlds)]
-        self._path = np.zeros((self.worlds, self.drones))
+        self.alive = np.ones((self.worlds, self.drones), bool)
+        self._recorder = Recorder(self.worlds, self.drones, seed)
         self._ranges = np.empty((self.worlds, self.drones, self.lidar.beams), np.float32)
         self._started = False
 
@@ -123,8 +105,8 @@ class Exploration:
         self.ticks[world] = 0
         self._idle[world] = 0
         self._limit[world] = self.settings.episode_ticks
-        self._curves[world] = []
-        self._path[world] = 0.0
+        self.alive[world] = True
+        self._recorder.begin(world, self.twin.poses[world])
 
     def step(self, actions: NDArray[np.float32]) -> Step:
         """Fly one tick with actions `[worlds, drones, action size]` in [-1, 1]."""
@@ -138,9 +120,7 @@ class Exploration:
                 f"level {self.twin.levels[world].name}: the action of drone {drone} in world {world}, "
                 f"at ({x:.2f}, {y:.2f}), is not finite"
             )
-        before = self.twin.poses[..., :2].copy()
         self.twin.step(self._setpoints(actions))
-        self._path += np.hypot(*np.moveaxis(self.twin.poses[..., :2] - before, -1, 0))
         self.ticks += 1
         reward = self._reward(self._sense(np.ones(self.worlds, bool)))
         done, episodes = self._finish()
@@ -171,6 +151,11 @@ class Exploration:
             active,
         )
 
+    @property
+    def ranges(self) -> NDArray[np.float32]:
+        """The newest turn of every drone's LiDAR, `[worlds, drones, beams]`: metres, inf no return, nan invalid."""
+        return self._ranges
+
     def links(self) -> NDArray[np.bool_]:
         """Tell which drones hear which now, bool `[worlds, drones, drones]`: a disc, the diagonal left out."""
         if self.settings.protocol == "off":
@@ -189,10 +174,10 @@ class Exploration:
 
     def _finish(self) -> tuple[NDArray[np.bool_], list[EpisodeMetrics]]:
         coverage = self.maps.coverage()
+        self._recorder.record(coverage, self.twin.poses, self.links(), self.maps.discovered, self.alive)
         done = np.zeros(self.worlds, bool)
         episodes = []
         for world in range(self.worlds):
-            self._curves[world].append(float(coverage[world]))
             busy = np.isfinite(self.maps.distance[world]).any()
             self._idle[world] = 0 if busy else self._idle[world] + 1
             if (
@@ -211,22 +196,17 @@ class Exploration:
         return done, episodes
 
     def _metrics(self, world: int) -> EpisodeMetrics:
-        curve = np.array(self._curves[world], np.float32)
-        known = (self.maps.layers[world, range(self.drones), range(self.drones)] != 0).sum()
-        return EpisodeMetrics(
-            world=world,
+        maps, own = self.maps, range(self.drones)
+        totals = EpisodeTotals(
             level=self.twin.levels[world].name,
-            ticks=int(self.ticks[world]),
-            coverage=float(curve[-1]),
-            curve=curve,
-            t90=_first_at_least(curve, 0.90),
-            t95=_first_at_least(curve, 0.95),
-            contacts=int(self.twin.contacts[world].sum()),
-            path_m=self._path[world].copy(),
-            discovered=self.maps.discovered[world].copy(),
-            tiles_sent=self.maps.tiles_sent[world].copy(),
-            overlap=float(known / max(1, self.maps.seen[world].sum())),
+            coverable=int(maps.coverable_cells[world]),
+            seen=int(maps.seen[world].sum()),
+            discovered=maps.discovered[world],
+            known=(maps.layers[world, own, own] != 0).sum(axis=(1, 2)),
+            contacts=self.twin.contacts[world],
+            tiles_sent=maps.tiles_sent[world],
         )
+        return self._recorder.finish(world, totals)
 
     def _observe(self) -> Observation:
         spec, lidar = self.settings.observation, self.lidar
@@ -289,8 +269,3 @@ def _weights(settings: ExplorationSettings) -> NDArray[np.float64]:
     if len(weights) != len(settings.levels) or (weights < 0).any() or weights.sum() <= 0:
         raise InputError("level_weights: give one weight for each of levels, none negative, not all zero")
     return np.asarray(weights / weights.sum())
-
-
-def _first_at_least(curve: NDArray[np.float32], share: float) -> int | None:
-    reached = np.flatnonzero(curve >= share)
-    return int(reached[0]) + 1 if len(reached) else None

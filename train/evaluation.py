@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
 from imagine.mesh_comm.settings import Protocol
-from imagine.sim.exploration import EpisodeMetrics, Exploration
+from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
+from imagine.sim.film import Film
+from imagine.sim.metrics import BYTE_KINDS, CONTACT_KINDS, EpisodeMetrics
 from imagine.train.policies import Policy, load_policy
 
 MAX_WORLDS = 16
 BYTES_PER_TILE = 150
-"""What a tile of the evidence map is taken to cost on the air; assumed, and scans, digests and status are left out."""
+"""What a tile of the evidence map is taken to cost on the air where the radio counts tiles and no bytes; assumed."""
 _RESAMPLES = 2000
 
 
@@ -42,15 +44,16 @@ def evaluate(
     seed: int = 0,
     env: ExplorationSettings | None = None,
     progress: Callable[[str], None] | None = None,
+    film: Film | None = None,
 ) -> list[dict[str, Any]]:
     """Fly `episodes` episodes on each level with each number of drones; return a row for each.
 
     Drones start at the level's launch point in the level as it is drawn. `env` gives what the rows do not (episode
     length, limits, radio); by default what the policy was made for. The deterministic policy flies. `progress` is told
-    what comes next.
+    what comes next; `film` takes the first episode of the first row.
     """
     base = env or (policy.env if isinstance(policy, Policy) else None) or ExplorationSettings()
-    rows = []
+    rows: list[dict[str, Any]] = []
     for level in levels:
         for count in drones:
             if progress is not None:
@@ -61,31 +64,46 @@ def evaluate(
                     "mirror": False, "random_launch": False, "stagger": False,
                 }
             )  # fmt: skip
-            finished = run_episodes(policy, settings, episodes, seed)
+            finished = run_episodes(policy, settings, episodes, seed, film if not rows else None)
             name = policy if isinstance(policy, str) else policy.name
             rows.append(row(name, level, count, protocol, finished, settings, seed))
     return rows
 
 
 def run_episodes(
-    policy: Policy | Literal["random", "frontier"], settings: ExplorationSettings, episodes: int, seed: int
+    policy: Policy | Literal["random", "frontier"],
+    settings: ExplorationSettings,
+    episodes: int,
+    seed: int,
+    film: Film | None = None,
 ) -> list[EpisodeMetrics]:
-    """Fly whole episodes in batches of worlds; each world gives one a batch, so that quick ones do not count double."""
+    """Fly whole episodes in batches of worlds; each world gives one a batch, so that quick ones do not count double.
+
+    `film` takes the first of them.
+    """
     finished: list[EpisodeMetrics] = []
     batch = 0
     while len(finished) < episodes:
         worlds = min(MAX_WORLDS, episodes - len(finished))
-        exploration = Exploration(settings.model_copy(update={"worlds": worlds}), seed + 1000 * batch)
-        finished.extend(_first_episodes(policy, exploration, np.random.default_rng([seed, batch])))
+        # a filmed world must stay as it ended, or its last picture would be of the next episode
+        filmed = film if batch == 0 else None
+        batch_settings = settings.model_copy(update={"worlds": worlds})
+        exploration = Exploration(batch_settings, seed + 1000 * batch, restart=filmed is None)
+        finished.extend(_first_episodes(policy, exploration, np.random.default_rng([seed, batch]), filmed))
         batch += 1
     return finished
 
 
 def _first_episodes(
-    policy: Policy | Literal["random", "frontier"], exploration: Exploration, rng: np.random.Generator
+    policy: Policy | Literal["random", "frontier"],
+    exploration: Exploration,
+    rng: np.random.Generator,
+    film: Film | None,
 ) -> list[EpisodeMetrics]:
-    """Return the first finished episode of every world."""
+    """Return the first finished episode of every world, and film that of world 0."""
     observation = exploration.reset()
+    if film is not None:
+        film.take(exploration, 0)
     first: dict[int, EpisodeMetrics] = {}
     shape = (exploration.worlds, exploration.drones, exploration.settings.action.size)
     while len(first) < exploration.worlds:
@@ -97,6 +115,8 @@ def _first_episodes(
             flat = {key: np.ascontiguousarray(a.reshape(-1, *a.shape[2:])) for key, a in observation.policy.items()}
             actions = np.clip(policy.act(flat), -1.0, 1.0).reshape(shape)
         step = exploration.step(actions)
+        if film is not None and 0 not in first:
+            film.take(exploration, 0)
         for episode in step.episodes:
             first.setdefault(episode.world, episode)
         observation = step.observation
@@ -112,7 +132,11 @@ def row(
     settings: ExplorationSettings,
     seed: int,
 ) -> dict[str, Any]:
-    """Return the means over episodes as a row; an episode that never reaches a coverage counts with its full length."""
+    """Return the means over episodes as a row.
+
+    An episode that never reaches a coverage counts with its full length. `productivity_ratio` is the geometric mean,
+    as becomes ratios; what a drone sent is estimated from its tiles where the radio counts no bytes.
+    """
     coverage = np.array([episode.coverage for episode in episodes])
     row: dict[str, Any] = {
         "policy": policy,
@@ -123,15 +147,39 @@ def row(
         "coverage_mean": float(coverage.mean()),
         "coverage_ci95": bootstrap_interval(coverage, np.random.default_rng(seed)),
     }
-    for name in ("t90", "t95"):
+    for name in ("t90", "t95", "t99"):
         ticks = [getattr(episode, name) for episode in episodes]
         row[f"{name}_mean"] = float(np.mean([settings.episode_ticks if t is None else t for t in ticks]))
         row[f"{name}_reached"] = float(np.mean([t is not None for t in ticks]))
     row["overlap"] = float(np.mean([episode.overlap for episode in episodes]))
     row["collisions_per_episode"] = float(np.mean([episode.contacts for episode in episodes]))
     row["path_m"] = float(np.mean([episode.path_m.mean() for episode in episodes]))
-    row["bytes_per_drone"] = float(np.mean([BYTES_PER_TILE * episode.tiles_sent.mean() for episode in episodes]))
+    sent = np.mean([_sent(episode).mean(axis=0) for episode in episodes], axis=0)
+    row["bytes_per_drone"] = float(sent.sum())
+    row["bytes_sent"] = dict(zip(BYTE_KINDS, sent.tolist(), strict=True))
+    row["collisions_by_kind"] = _contacts_by_kind(episodes)
+    row["productivity_ratio"] = float(np.exp(np.mean([np.log(episode.productivity_ratio) for episode in episodes])))
+    row["link_share"] = float(np.mean([episode.link_share for episode in episodes]))
+    row["survivors"] = float(np.mean([(episode.alive_ticks == episode.ticks).mean() for episode in episodes]))
     return row
+
+
+def _sent(episode: EpisodeMetrics) -> NDArray[np.float64]:
+    """Return the bytes each drone sent, `[drones, 4]` by BYTE_KINDS."""
+    if episode.bytes_by is not None:
+        return episode.bytes_by.astype(np.float64)
+    sent = np.zeros((len(episode.tiles_sent), len(BYTE_KINDS)))
+    sent[:, BYTE_KINDS.index("tile")] = BYTES_PER_TILE * episode.tiles_sent
+    return sent
+
+
+def _contacts_by_kind(episodes: Sequence[EpisodeMetrics]) -> dict[str, float] | None:
+    """Return the team's contacts an episode by CONTACT_KINDS, None where an episode does not tell them apart."""
+    known = [episode.contacts_by for episode in episodes if episode.contacts_by is not None]
+    if len(known) < len(episodes):
+        return None
+    means = np.mean([contacts.sum(axis=0) for contacts in known], axis=0)
+    return dict(zip(CONTACT_KINDS, means.tolist(), strict=True))
 
 
 def bootstrap_interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float]:

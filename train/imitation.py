@@ -14,7 +14,8 @@ from torch import Tensor
 
 from imagine.core.config import Settings
 from imagine.core.errors import WorkError
-from imagine.sim.exploration import EpisodeMetrics, Exploration, Observation
+from imagine.sim.exploration import Exploration, Observation
+from imagine.sim.metrics import EpisodeMetrics
 from imagine.train.networks import Actor
 from imagine.train.rollout import OBSERVATION_KEYS, actor_inputs, agent_tensors, env_actions
 

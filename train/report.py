@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from imagine.sim.exploration import EpisodeMetrics
+from imagine.sim.metrics import EpisodeMetrics
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class RecentEpisodes:
     by_level: dict[str, deque[tuple[float, float, float]]] = field(default_factory=dict)
 
     def add(self, episodes: Iterable[EpisodeMetrics]) -> None:
-        """Take finished episodes ."""
+        """Take finished episodes."""
         for episode in episodes:
             kept = self.by_level.setdefault(str(episode.level), deque(maxlen=RECENT_EPISODES))
             t90 = self.episode_ticks if episode.t90 is None else episode.t90

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imagine.sim.exploration import EpisodeMetrics, Exploration, Observation
+from imagine.sim.exploration import Exploration, Observation
+from imagine.sim.metrics import EpisodeMetrics
 from imagine.train.networks import Actor, Critic, log_probability
 
 OBSERVATION_KEYS = ("views", "lidar", "motion")

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("pettingzoo", reason="PettingZoo is not installed: it comes with the extra 'train'")
 
-from pettingzoo.test import parallel_api_test
+from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from imagine.core.contract import ActionSpec
 from imagine.core.errors import InputError
@@ -19,6 +19,7 @@ from imagine.core.observation_spec import ObservationSpec
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.parallel_env import ExplorationEnv
+from imagine.sim.render import DRONES, frame_of
 
 SMALL = ExplorationSettings(
     levels=("0",), drones=2, episode_ticks=40, mirror=False, observation=ObservationSpec(view_cells=16)
@@ -49,6 +50,111 @@ def flat(told: Any) -> list[Any]:
 @pytest.mark.filterwarnings("error")
 def test_it_passes_pettingzoos_own_test(mode: str) -> None:
     parallel_api_test(ExplorationEnv(SMALL.model_copy(update={"action": ActionSpec(mode=mode)})), num_cycles=45)
+
+
+@pytest.mark.filterwarnings("error")
+def test_it_passes_pettingzoos_own_seed_test() -> None:
+    parallel_seed_test(lambda: ExplorationEnv(SMALL), num_cycles=20)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        ObservationSpec(view_cells=8, view_scales_m=(0.2,), frontier_ranges_m=(2.0,), lidar_sectors=7),
+        ObservationSpec(
+            view_cells=10, view_scales_m=(0.1, 0.2, 0.4, 0.8), frontier_ranges_m=(1.0,) * 4, axes="heading"
+        ),
+    ],
+    ids=["one scale", "four scales"],
+)
+@pytest.mark.parametrize("mode", ["plane", "body"])
+def test_spaces_follow_the_specifications(spec: ObservationSpec, mode: str) -> None:
+    env = ExplorationEnv(SMALL.model_copy(update={"observation": spec, "action": ActionSpec(mode=mode)}))
+    observations, _ = env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        for agent, seen in observations.items():
+            assert {name: array.shape for name, array in seen.items()} == spec.shapes
+            assert env.observation_space(agent).contains(seen)
+            assert env.action_space(agent).shape == (ActionSpec(mode=mode).size,)
+        observations = env.step(random_actions(env, rng))[0]
+
+
+def fall(env: ExplorationEnv, drone: int) -> None:
+    """Let a drone fall, as a touch does where touching kills."""
+    env._exploration.alive[0, drone] = False
+
+
+def test_who_falls_terminates_alone_and_is_no_agent_from_then_on() -> None:
+    env = ExplorationEnv(SMALL)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    env.step(random_actions(env, rng))
+    fall(env, 0)
+    observations, rewards, terminations, truncations, infos = env.step(random_actions(env, rng))
+    assert list(observations) == list(rewards) == list(infos) == ["drone_1", "drone_2"]
+    assert terminations == {"drone_1": True, "drone_2": False}
+    assert not any(truncations.values())
+    assert [info["alive"] for info in infos.values()] == [False, True]
+    assert env.agents == ["drone_2"]
+    acting = random_actions(env, rng)
+    assert list(acting) == ["drone_2"]
+    before = env._exploration.twin.poses[0].copy()
+    for _ in range(3):
+        told = env.step({"drone_2": np.array([0.0, 1.0], np.float32)})
+        assert all(list(part) == ["drone_2"] for part in told)
+    assert env._exploration.twin.poses[0, 1, 1] > before[1, 1] + 0.05  # the action went to the right drone
+    assert env.state().shape == (2, 5, 32, 32)
+    fall(env, 1)
+    _, _, terminations, _, _ = env.step({"drone_2": np.zeros(2, np.float32)})
+    assert terminations == {"drone_2": True}
+    assert env.agents == []
+    observations, _ = env.reset(seed=0)
+    assert list(observations) == env.agents == ["drone_1", "drone_2"]
+
+
+def test_who_falls_in_the_last_tick_was_not_cut_short() -> None:
+    env = ExplorationEnv(SMALL.model_copy(update={"episode_ticks": 2, "stop_coverage": 1.0}))
+    env.reset(seed=0)
+    zero = {agent: np.zeros(2, np.float32) for agent in env.agents}
+    env.step(zero)
+    fall(env, 1)
+    _, _, terminations, truncations, _ = env.step(zero)
+    assert terminations == {"drone_1": False, "drone_2": True}
+    assert truncations == {"drone_1": True, "drone_2": False}
+    assert env.agents == []
+
+
+def test_it_draws_itself_where_wanted() -> None:
+    env = ExplorationEnv(SMALL, render_mode="rgb_array", render_px=400)
+    assert "rgb_array" in env.metadata["render_modes"]
+    assert env.metadata["render_fps"] == 10
+    with pytest.raises(InputError, match="reset"):
+        env.render()
+    env.reset(seed=0)
+    first = env.render()
+    for _ in range(8):
+        env.step(dict.fromkeys(env.agents, np.array([0.0, 1.0], np.float32)))
+    picture = env.render()
+    assert picture is not None
+    assert picture.dtype == np.uint8
+    assert picture.shape == first.shape == env.render().shape
+    assert (picture != first).any()
+    frame = frame_of(env._exploration.twin.levels[0], 400)
+    poses = env._exploration.twin.poses[0]
+    for drone in range(2):  # the disc of each, beside its number
+        row, column = frame.pixel(poses[drone, 0], poses[drone, 1])
+        assert (picture[row - 5 : row + 6, column - 5 : column + 6] == DRONES[drone]).all(axis=-1).any()
+    env.close()
+
+
+def test_without_a_render_mode_it_draws_nothing_and_says_so() -> None:
+    env = ExplorationEnv(SMALL)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="rgb_array"):
+        assert env.render() is None
+    with pytest.raises(InputError, match="human"):
+        ExplorationEnv(SMALL, render_mode="human")  # type: ignore[arg-type]
 
 
 def test_the_seed_decides_everything() -> None:

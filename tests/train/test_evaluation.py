@@ -5,15 +5,17 @@ import pytest
 
 from imagine.core.errors import InputError
 from imagine.core.observation_spec import ObservationSpec
-from imagine.sim.exploration import EpisodeMetrics
 from imagine.sim.exploration_settings import ExplorationSettings
-from imagine.train.evaluation import bootstrap_interval, evaluate, named_policy, row
+from imagine.sim.film import Film
+from imagine.sim.metrics import BYTE_KINDS, EpisodeMetrics
+from imagine.train.evaluation import BYTES_PER_TILE, bootstrap_interval, evaluate, named_policy, row, run_episodes
 from imagine.train.networks import Actor, NetworkSettings
 from imagine.train.policies import policy_of
 
 KEYS = [
     "policy", "level", "drones", "protocol", "episodes", "coverage_mean", "coverage_ci95", "t90_mean", "t90_reached",
-    "t95_mean", "t95_reached", "overlap", "collisions_per_episode", "path_m", "bytes_per_drone",
+    "t95_mean", "t95_reached", "t99_mean", "t99_reached", "overlap", "collisions_per_episode", "path_m",
+    "bytes_per_drone", "bytes_sent", "collisions_by_kind", "productivity_ratio", "link_share", "survivors",
 ]  # fmt: skip
 SHORT = ExplorationSettings(episode_ticks=150, observation=ObservationSpec(view_cells=16, lidar_sectors=16))
 
@@ -46,19 +48,75 @@ def test_a_network_flies_and_protocol_off_sends_nothing():
     assert row["bytes_per_drone"] == 0.0
 
 
-def episode(coverage, t90):
+def episode(coverage=0.5, t90=None, **changes):
     zeros = np.zeros(2, np.int64)
-    curve = np.array([coverage], np.float32)
-    return EpisodeMetrics(0, "x", 500, coverage, curve, t90, None, 1, np.array([2.0, 4.0]), zeros, zeros + 10, 1.5)
+    given = {
+        "world": 0, "seed": 0, "level": "x", "ticks": 500, "coverage": coverage,
+        "curve": np.array([coverage], np.float32), "t90": t90, "t95": None, "t99": None, "overlap": 1.5,
+        "path_m": np.array([2.0, 4.0]), "discovered": zeros, "drone_curves": np.zeros((2, 1), np.float32),
+        "known": zeros, "contacts": 1, "tiles_sent": zeros + 10, "link_ticks": zeros,
+        "pair_ticks": np.zeros((2, 2), np.int64), "alive_ticks": zeros + 500,
+    }  # fmt: skip
+    return EpisodeMetrics(**(given | changes))
+
+
+def row_of(*episodes):
+    return row("p", "x", 2, "one-hop", episodes, SHORT, 0)
 
 
 def test_an_episode_that_never_gets_there_counts_with_its_full_length():
-    numbers = row("p", "x", 2, "one-hop", [episode(0.95, 100), episode(0.5, None)], SHORT, 0)
+    numbers = row_of(episode(0.95, 100), episode(0.5, None))
     assert numbers["t90_mean"] == (100 + 150) / 2
     assert numbers["t90_reached"] == 0.5
     assert numbers["t95_reached"] == 0.0
+    assert numbers["t99_mean"] == 150.0
     assert numbers["path_m"] == 3.0
     assert numbers["collisions_per_episode"] == 1.0
+
+
+def test_bytes_are_the_radios_where_it_counts_them_and_else_guessed_from_tiles():
+    assert row_of(episode())["bytes_per_drone"] == 10 * BYTES_PER_TILE
+    assert row_of(episode())["bytes_sent"] == {"scan": 0.0, "tile": 10.0 * BYTES_PER_TILE, "digest": 0.0, "status": 0.0}
+    counted = row_of(episode(bytes_by=np.array([[1, 2, 3, 4], [5, 6, 7, 8]])), episode(bytes_by=np.full((2, 4), 10)))
+    assert counted["bytes_sent"] == dict(zip(BYTE_KINDS, [6.5, 7.0, 7.5, 8.0], strict=True))
+    assert counted["bytes_per_drone"] == sum(counted["bytes_sent"].values())
+
+
+def test_contacts_by_kind_are_told_where_every_episode_tells_them():
+    told = np.array([[1, 2, 0], [3, 0, 0]])
+    assert row_of(episode(), episode(contacts_by=told))["collisions_by_kind"] is None
+    both = row_of(episode(contacts_by=told), episode(contacts_by=0 * told))
+    assert both["collisions_by_kind"] == {"wall": 2.0, "drone": 1.0, "mover": 0.0}
+
+
+def test_what_the_team_is_like_is_averaged_over_episodes():
+    one = episode(discovered=np.array([80, 10]), link_ticks=np.array([500, 250]))
+    other = episode(discovered=np.array([20, 10]), alive_ticks=np.array([500, 499]))
+    told = row_of(one, other)
+    assert told["productivity_ratio"] == pytest.approx(4.0)  # of 8 and 2
+    assert told["link_share"] == pytest.approx((0.75 + 0.0) / 2)
+    assert told["survivors"] == pytest.approx(0.75)
+
+
+def test_filming_shows_the_first_episode_to_its_end_and_changes_no_result():
+    settings = SHORT.model_copy(update={"levels": ("0",), "drones": 2, "mirror": False, "random_launch": False})
+    film = Film(200)
+    filmed = run_episodes("random", settings, 3, 1, film)
+    plain = run_episodes("random", settings, 3, 1)
+    assert [told.ticks for told in filmed] == [told.ticks for told in plain]
+    for one, other in zip(filmed, plain, strict=True):
+        np.testing.assert_array_equal(one.curve, other.curve)
+    *_, last = film.scenes
+    assert last.tick == filmed[0].ticks
+    assert last.coverage == pytest.approx(filmed[0].coverage, abs=1e-6)
+    assert next(film.scenes).tick == 0
+
+
+def test_of_several_rows_the_first_is_filmed():
+    film = Film(200)
+    rows = evaluate("frontier", ["1", "0"], drones=(2,), episodes=1, env=SHORT, film=film)
+    assert len(rows) == 2
+    assert {scene.level.name for scene in film.scenes} == {"1"}
 
 
 def test_the_interval_holds_the_mean_and_narrows_with_more_episodes():
