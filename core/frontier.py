@@ -368,6 +368,15 @@ def search_scratch(cells: int) -> tuple[NDArray[np.int32], NDArray[np.int32], ND
 
 
 @numba.njit(cache=True, nogil=True)
+def has_frontier(kinds):  # type: ignore[no-untyped-def]
+    """Tell whether any cell is a frontier."""
+    for kind in kinds.ravel():
+        if kind & np.uint8(_FRONTIER):
+            return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
 def fill_distance(cost, distance):  # type: ignore[no-untyped-def]
     """Write padded costs (int16) as metres into `distance` (float32 `[rows, columns]`), inf where none was found."""
     rows, columns = distance.shape

@@ -6,8 +6,8 @@ new scans become evidence, maps over the radio, observations and reward.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,31 +15,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
-from imagine.core.lidar import PRESETS
-from imagine.core.planner import plan_kernel
+from imagine.core.lidar import TEAMMATE_RADIUS_M
+from imagine.sim.air import Air
+from imagine.sim.air_receive import claim_own
+from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
 from imagine.sim.decision_state import DecisionState
-from imagine.sim.exploration_kernels import fill_critic, fill_observations, shielded_setpoints
 from imagine.sim.exploration_settings import ExplorationSettings
+from imagine.sim.exploration_tick import (
+    ALL_STAGES,
+    FLYING,
+    LAUNCHING,
+    OBSERVE,
+    STAGE_NAMES,
+    WAITING,
+    Batch,
+    Specs,
+    tick_worlds,
+)
+from imagine.sim.keyed_noise import root_keys
 from imagine.sim.level import Level, load_level, mirrored
 from imagine.sim.metrics import EpisodeMetrics, EpisodeTotals, Recorder
+from imagine.sim.planner_actions import plan_worlds
+from imagine.sim.reward import rewards, survivors, sweep_cells
 from imagine.sim.team_maps import TeamMaps
 from imagine.sim.twin import TICK_S, Twin
 
-CRITIC_CHANNELS, CRITIC_CELLS = 5, 32
+__all__ = ["CRITIC_CELLS", "CRITIC_CHANNELS", "EpisodeMetrics", "Exploration", "Observation", "Step"]
+
 _IDLE_TICKS = 30  # an episode ends when nobody has had a frontier for so long
+_AIR_KEY = 0x41495221  # so that radio losses and sensor noise of a seed are not drawn from the same keys
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What policies see (`[worlds, drones, ...]`, named as ObservationSpec.shapes) and what the critic sees."""
+    """What policies see (`[worlds, drones, ...]`, named as ObservationSpec.shapes), and on demand what a critic sees.
+
+    The arrays are the batch's own and good until the step after the next: copy what you keep longer.
+    """
 
     policy: dict[str, NDArray[np.float32]]
-    critic: NDArray[np.float32]
+    _exploration: Exploration
+
+    @property
+    def critic(self) -> NDArray[np.float32]:
+        """Images of the whole level for a centralised critic, `[worlds, drones, channels, n, n]`, as it is now."""
+        return self._exploration.critic_images()
 
 
 @dataclass(frozen=True)
 class Step:
-    """What a tick brings: the next observation, reward `[worlds, drones]`, which worlds ended, their metrics."""
+    """What a decision brings: the next observation, reward `[worlds, drones]`, which worlds ended, their metrics."""
 
     observation: Observation
     reward: NDArray[np.float32]
@@ -48,38 +73,82 @@ class Step:
 
 
 class Exploration:
-    """A batch of worlds being explored; finished worlds start anew by themselves."""
+    """A batch of worlds being explored; finished worlds start anew by themselves.
+
+    `alive` bool `[worlds, drones]`; `ticks` `[worlds]` of the episodes in progress; `estimates` `[worlds, drones, 3]`
+    what drones take their poses to be. With `stage_seconds` set to a dict of names, steps run stage by stage and add
+    up how long each took; slower, for profiles.
+    """
 
     dt = TICK_S
 
-    def __init__(self, settings: ExplorationSettings, seed: int, restart: bool = True) -> None:
-        """Load the levels and start the first episodes. Equal settings and seed give equal runs.
+    def __init__(
+        self,
+        settings: ExplorationSettings,
+        seed: int,
+        restart: bool = True,
+        world_keys: Sequence[int] | None = None,
+    ) -> None:
+        """Load the levels. Equal settings and seed give equal runs, and `reset` starts the first episodes.
 
-        Without `restart` a finished world stays as it ended until `reset`.
+        Without `restart` a finished world stays as it ended until `reset`. All that is random in a world depends on
+        `seed` and its key (default: its index) alone, so world k of a batch equals a batch of one with `world_keys=[k]`.
         """
         self.settings = settings
         self._restarts = restart
-        self.worlds, self.drones = settings.worlds, settings.drones
-        self.lidar = PRESETS[settings.lidar]
+        worlds, drones = settings.worlds, settings.drones
+        self.worlds, self.drones, self.seed = worlds, drones, seed
+        self.lidar = settings.lidar_spec
+        keys = list(range(worlds)) if world_keys is None else list(world_keys)
         self._variants = [_variants(load_level(name), settings.mirror) for name in settings.levels]
         self._weights = _weights(settings)
-        self._generators = [np.random.default_rng([seed, world]) for world in range(self.worlds)]
+        self._generators = [np.random.default_rng([seed, key]) for key in keys]
         grids = [level.grid for variants in self._variants for level in variants]
         rows, columns = max(g[3] for g in grids), max(g[2] for g in grids)
-        first = [self._draw_level(world) for world in range(self.worlds)]
-        self.twin = Twin(first, self.drones, self.lidar, settings.limits, seed)
-        self.maps = TeamMaps(self.worlds, self.drones, rows, columns, self.twin.workers)
-        self.decisions = DecisionState(
-            self.worlds, self.drones, rows, columns, settings.observation, settings.action, self.twin.workers
+        first = [self._draw_level(world) for world in range(worlds)]
+        self.twin = Twin(first, drones, self.lidar, settings.limits, seed, settings.dynamics, keys, settings.sensing)
+        workers = self.twin.workers
+        cap = settings.map.range_cap_m
+        self.maps = TeamMaps(worlds, drones, rows, columns, self.lidar, cap, workers)
+        self.air = Air(
+            worlds, drones, *self.maps.versions.shape[3:], settings.radio, settings.mesh, self.lidar, cap, TICK_S
         )
-        self.alive = np.ones((self.worlds, self.drones), bool)
-        self.ticks = np.zeros(self.worlds, np.int64)
-        self._idle = np.zeros(self.worlds, np.int64)
-        self._limit = np.full(self.worlds, settings.episode_ticks)
-        self.alive = np.ones((self.worlds, self.drones), bool)
-        self._recorder = Recorder(self.worlds, self.drones, seed)
-        self._ranges = np.empty((self.worlds, self.drones, self.lidar.beams), np.float32)
-        self._started = False
+        self.decisions = DecisionState(worlds, drones, rows, columns, settings.observation, settings.action, workers)
+        self._recorder = Recorder(worlds, drones, seed)
+        self.ticks = np.zeros(worlds, np.int64)
+        self._idle = np.zeros(worlds, np.int64)
+        self._limit = np.full(worlds, settings.episode_ticks)
+        self._swept = sweep_cells(cap, settings.action.speed_mps, TICK_S)
+        self.ranges = np.full((worlds, drones, self.lidar.beams), np.inf, np.float32)
+        """The newest turn of every drone's LiDAR, `[worlds, drones, beams]`: metres, inf no return, nan invalid."""
+        self.estimates = self.twin.poses
+        self.stage_seconds: dict[str, float] | None = None
+        self._specs = _specs(settings, self.decisions)
+        self._sight_m = max(cap + 2.0 * TEAMMATE_RADIUS_M, settings.observation.lidar_range_m)
+        batch = self._new_batch(keys)
+        self._batches = batch, batch._replace(**self._observation_arrays())
+        self._turn = 0
+
+    def _new_batch(self, keys: list[int]) -> Batch:
+        size = (self.worlds, self.drones)
+        return Batch(
+            modes=np.zeros(self.worlds, np.int64), ticks=self.ticks, scans=np.zeros(self.worlds, np.int64),
+            keys=root_keys(self.seed ^ _AIR_KEY, np.array(keys)), intents=self.decisions.intents,
+            setpoints=np.zeros((*size, 3)), poses=self.twin.poses, velocity=self.twin.velocity,
+            estimates=self.estimates, alive=self.twin.alive, places=np.full((*size, self.drones, 2), np.nan),
+            ranges=self.ranges, maps=self.maps.arrays, pens=self.maps.pens, air=self.air.state,
+            **self._observation_arrays(),
+        )  # fmt: skip
+
+    def _observation_arrays(self) -> dict[str, Any]:
+        shapes = self.settings.observation.shapes
+        names = {"views": "views", "lidar": "sectors", "motion": "motion"}
+        return {field: np.zeros((self.worlds, self.drones, *shapes[key]), np.float32) for key, field in names.items()}
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        """Who still flies, bool `[worlds, drones]`."""
+        return self.twin.alive
 
     def _draw_level(self, world: int) -> Level:
         generator = self._generators[world]
@@ -93,8 +162,8 @@ class Exploration:
             if self.settings.stagger:
                 share = (world + 1) / self.worlds
                 self._limit[world] = max(50, round(self.settings.episode_ticks * share))
-        self._sense(np.ones(self.worlds, bool))
-        return self._observe()
+        self._run(np.full(self.worlds, LAUNCHING))
+        return self._observation()
 
     def _restart(self, world: int) -> None:
         level = self._draw_level(world)
@@ -102,14 +171,35 @@ class Exploration:
         self.twin.set_level(world, level, level.launch_poses(self.drones, generator))
         column0, row0, _, _ = level.grid
         self.maps.clear(world, level.coverable, (column0, row0))
+        self.air.clear(world)
+        self.decisions.clear(world)
         self.ticks[world] = 0
         self._idle[world] = 0
         self._limit[world] = self.settings.episode_ticks
-        self.alive[world] = True
         self._recorder.begin(world, self.twin.poses[world])
 
     def step(self, actions: NDArray[np.float32]) -> Step:
-        """Fly one tick with actions `[worlds, drones, action size]` in [-1, 1]."""
+        """Fly one decision (`ActionSpec.decision_ticks` ticks) with actions `[worlds, drones, action size]` in [-1, 1].
+
+        Raises InputError naming level, drone and place where an action is not finite.
+        """
+        self._check(actions)
+        self.decisions.decide(np.asarray(actions, np.float32), self.estimates)
+        self._turn = 1 - self._turn
+        reward = np.zeros((self.worlds, self.drones), np.float32)
+        running = np.ones(self.worlds, bool)
+        ticks = self.settings.action.decision_ticks
+        for tick in range(ticks):  # a world that ends waits for the others' decisions to end
+            reward += self._tick(running, tick == ticks - 1)
+        done = ~running
+        episodes = [self._metrics(int(world)) for world in np.flatnonzero(done)]
+        if self._restarts and done.any():
+            for world in np.flatnonzero(done):
+                self._restart(int(world))
+            self._run(np.where(done, LAUNCHING, WAITING))  # what they see at their launch is nobody's gain
+        return Step(self._observation(), reward, done, episodes)
+
+    def _check(self, actions: NDArray[np.float32]) -> None:
         expected = (self.worlds, self.drones, self.settings.action.size)
         if actions.shape != expected:
             raise InputError(f"actions are {actions.shape}, expected {expected}")
@@ -120,140 +210,121 @@ class Exploration:
                 f"level {self.twin.levels[world].name}: the action of drone {drone} in world {world}, "
                 f"at ({x:.2f}, {y:.2f}), is not finite"
             )
-        self.twin.step(self._setpoints(actions))
-        self.ticks += 1
-        reward = self._reward(self._sense(np.ones(self.worlds, bool)))
-        done, episodes = self._finish()
-        return Step(self._observe(), reward, done, episodes)
 
-    def _setpoints(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
-        setpoints = np.zeros((self.worlds, self.drones, 3))
-        limits, lidar = self.settings.limits, self.lidar
-        self.decisions.decide(actions, self.twin.poses)
-        shielded_setpoints(
-            setpoints, self.decisions.intents, self.decisions.parameters, self.twin.poses, self._ranges,
-            (lidar.range_min, lidar.start, lidar.increment),
-            (limits.radius_m, limits.lag_s, limits.acceleration_mps2),
+    def _tick(self, running: NDArray[np.bool_], observe: bool) -> NDArray[np.float32]:
+        """Fly one tick in the `running` worlds, clear the flag of those that end with it, return what was earned."""
+        touched = self.twin.contacts.copy()
+        flying = self.alive & running[:, None]
+        self.ticks += running
+        self._run(np.where(running, FLYING, WAITING), ALL_STAGES if observe else ALL_STAGES & ~OBSERVE)
+        gained = np.where(running[:, None], self.maps.arrays.gained, 0)
+        begun = self.twin.contacts - touched
+        coverage = self.maps.coverage()
+        completed = running & (coverage >= self.settings.stop_coverage)
+        earned = rewards(gained, begun, flying, self.maps.coverable_cells, self.settings.reward, self._swept, completed)
+        self.alive[...] = np.where(running[:, None], survivors(self.alive, begun, self.settings.reward), self.alive)
+        self._recorder.record(coverage, self.twin.poses, self.links(), self.maps.discovered, self.alive, running)
+        self._idle[...] = np.where(running, np.where(self.maps.arrays.frontiers.any(axis=1), 0, self._idle + 1), self._idle)
+        over = completed | (self.ticks >= self._limit) | (self._idle >= _IDLE_TICKS) | ~self.alive.any(axis=1)
+        running &= ~over
+        return earned
+
+    def _run(self, modes: NDArray[np.int64], stages: int = ALL_STAGES) -> None:
+        """Run stages of a tick in all worlds, as `modes` says for each."""
+        twin, batch = self.twin, self._batches[self._turn]
+        batch.modes[...] = modes
+        arguments = (
+            batch, self._specs, twin.sensors(self._sight_m), twin.kernel_args(), twin.mover_discs, twin.mover_edges,
+            twin.limits.radius_m,
         )  # fmt: skip
-        return setpoints
-
-    def _sense(self, active: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Scan, map and share in the `active` worlds; return the cells each drone was the first to see there."""
-        self._ranges[active] = self.twin.scan()[active]
-        lidar = self.lidar
-        return self.maps.update(
-            self._ranges,
-            self.twin.poses,
-            (lidar.start, lidar.increment, lidar.range_min, self.settings.map.range_cap_m),
-            self.links(),
-            self.settings.protocol == "multi-hop",
-            self.settings.tiles_a_tick,
-            active,
-        )
-
-    @property
-    def ranges(self) -> NDArray[np.float32]:
-        """The newest turn of every drone's LiDAR, `[worlds, drones, beams]`: metres, inf no return, nan invalid."""
-        return self._ranges
+        if self.stage_seconds is None:
+            twin.workers.over(self.worlds, tick_worlds, stages, *arguments, scratch=self.maps.scratch)
+        else:
+            for index, name in enumerate(STAGE_NAMES):
+                began = time.perf_counter()
+                twin.workers.over(self.worlds, tick_worlds, stages & 1 << index, *arguments, scratch=self.maps.scratch)
+                self.stage_seconds[name] = self.stage_seconds.get(name, 0.0) + time.perf_counter() - began
+        twin.ticks += 1
+        active = modes != WAITING
+        self.decisions.sense(self.estimates, self.links(), self.maps.origins, self.alive, active, self.dt)
+        if stages & OBSERVE:
+            self.decisions.fill(batch.views, batch.motion, self.estimates, self.maps.origins)
 
     def links(self) -> NDArray[np.bool_]:
-        """Tell which drones hear which now, bool `[worlds, drones, drones]`: a disc, the diagonal left out."""
+        """Tell who exchanges maps with whom now, bool `[worlds, drones, drones]`; nobody under the protocol `off`."""
         if self.settings.protocol == "off":
             return np.zeros((self.worlds, self.drones, self.drones), bool)
-        positions = self.twin.poses[..., :2]
-        apart = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
-        linked: NDArray[np.bool_] = (apart <= self.settings.radio_range_m) & ~np.eye(self.drones, dtype=bool)
+        linked: NDArray[np.bool_] = self.air.state.reach.astype(bool)
+        linked &= self.alive[:, :, None] & self.alive[:, None]
         return linked
 
-    def _reward(self, gained: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Share of the level newly seen, half for the finder and half for the team (each drone's equal part)."""
-        share = gained / self.maps.coverable_cells[:, None]
-        own, team = self.settings.own_credit, 1.0 - self.settings.own_credit
-        reward = self.settings.reward_scale * (own * share + team * share.mean(axis=1, keepdims=True))
-        return np.asarray(reward, np.float32)
-
-    def _finish(self) -> tuple[NDArray[np.bool_], list[EpisodeMetrics]]:
-        coverage = self.maps.coverage()
-        self._recorder.record(coverage, self.twin.poses, self.links(), self.maps.discovered, self.alive)
-        done = np.zeros(self.worlds, bool)
-        episodes = []
-        for world in range(self.worlds):
-            busy = np.isfinite(self.maps.distance[world]).any()
-            self._idle[world] = 0 if busy else self._idle[world] + 1
-            if (
-                coverage[world] >= self.settings.stop_coverage
-                or self.ticks[world] >= self._limit[world]
-                or self._idle[world] >= _IDLE_TICKS
-            ):
-                done[world] = True
-                episodes.append(self._metrics(world))
-        if not self._restarts:
-            return done, episodes
-        for ended in np.flatnonzero(done):
-            self._restart(int(ended))
-        if done.any():
-            self._sense(done)  # what they see at their launch is nobody's gain
-        return done, episodes
-
     def _metrics(self, world: int) -> EpisodeMetrics:
-        maps, own = self.maps, range(self.drones)
+        maps, twin, own = self.maps, self.twin, range(self.drones)
+        for drone in own:
+            claim_own(self.air.state, world, drone, maps.layers[world, drone, drone], maps.versions[world, drone, drone])
         totals = EpisodeTotals(
-            level=self.twin.levels[world].name,
+            level=twin.levels[world].name,
             coverable=int(maps.coverable_cells[world]),
             seen=int(maps.seen[world].sum()),
             discovered=maps.discovered[world],
             known=(maps.layers[world, own, own] != 0).sum(axis=(1, 2)),
-            contacts=self.twin.contacts[world],
-            tiles_sent=maps.tiles_sent[world],
+            contacts=np.stack((twin.wall_contacts[world], twin.drone_contacts[world], twin.mover_contacts[world]), -1),
+            bytes_by=self.air.state.bytes_sent[world],
+            cells_by=self.air.state.cells_known[world],
         )
         return self._recorder.finish(world, totals)
 
-    def _observe(self) -> Observation:
-        spec, lidar = self.settings.observation, self.lidar
-        batch = (self.worlds, self.drones)
-        policy = {name: np.empty((*batch, *shape), np.float32) for name, shape in spec.shapes.items()}
-        critic = np.zeros((*batch, CRITIC_CHANNELS, CRITIC_CELLS, CRITIC_CELLS), np.float32)
-        workers = self.twin.workers
-        workers.over(
-            self.worlds, fill_observations, policy["views"], policy["lidar"], policy["motion"],
-            self.maps.belief, self.maps.distance, self.maps.origins, self.twin.poses, self.twin.velocity, self._ranges,
-            (lidar.range_min, lidar.start, lidar.increment), np.array(spec.view_scales_m),
-            np.array(spec.frontier_ranges_m), spec.lidar_range_m, spec.speed_mps, spec.yaw_rate_rps,
-            spec.axes == "heading",
-        )  # fmt: skip
-        workers.over(
-            self.worlds, fill_critic, critic, self.maps.seen, self.maps.coverable, self.maps.origins, self.twin.poses
+    def _observation(self) -> Observation:
+        batch = self._batches[self._turn]
+        return Observation({"views": batch.views, "lidar": batch.sectors, "motion": batch.motion}, self)
+
+    def critic_images(self) -> NDArray[np.float32]:
+        """Return what a centralised critic sees of every drone's world, float32 `[worlds, drones, channels, n, n]`."""
+        critic = np.zeros((self.worlds, self.drones, CRITIC_CHANNELS, CRITIC_CELLS, CRITIC_CELLS), np.float32)
+        maps = self.maps
+        self.twin.workers.over(
+            self.worlds, fill_critic, critic, maps.seen, maps.coverable, maps.origins, self.twin.poses
         )
-        return Observation(policy, critic)
+        return critic
 
     def planner_actions(self) -> NDArray[np.float32]:
-        """Return the frontier planner's action for every drone, nan where it sees no frontier to go to."""
+        """Return the frontier planner's action for every drone, nan where it is dead or sees no frontier to go to."""
         actions = np.full((self.worlds, self.drones, self.settings.action.size), np.nan, np.float32)
+        hold_s = (self.settings.action.decision_ticks - 1) * self.dt
         lidar = self.lidar
-        for world in range(self.worlds):
-            column0, row0 = self.maps.origins[world]
-            for drone in range(self.drones):
-                x, y, yaw = self.twin.poses[world, drone]
-                ux, uy, found = plan_kernel(
-                    self.maps.distance[world, drone], self.maps.states[world, drone], column0, row0, x, y, yaw,
-                    self._ranges[world, drone], lidar.range_min, lidar.start, lidar.increment,
-                )  # fmt: skip
-                if not found:
-                    continue
-                if self.settings.action.mode == "body" or self.settings.observation.axes == "heading":
-                    c, s = math.cos(yaw), math.sin(yaw)
-                    ux, uy = c * ux + s * uy, -s * ux + c * uy
-                actions[world, drone] = (ux, uy, 0.0)[: self.settings.action.size]
+        self.twin.workers.over(
+            self.worlds, plan_worlds, actions, self.maps.arrays, self.estimates, self.alive, self.ranges,
+            (lidar.range_min, lidar.start, lidar.increment), self.decisions.parameters, hold_s,
+        )  # fmt: skip
         return actions
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what decides the next episodes: the generators' states."""
-        return {"generators": [generator.bit_generator.state for generator in self._generators]}
+        """Return what decides the next episodes: the generators' states, and how many episodes each world has had."""
+        return {
+            "generators": [generator.bit_generator.state for generator in self._generators],
+            "episodes": self.twin.episodes.tolist(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up the generators' states of an earlier run; episodes in progress start anew."""
+        """Take up the state of an earlier run; episodes in progress start anew."""
         for generator, saved in zip(self._generators, state["generators"], strict=True):
             generator.bit_generator.state = saved
+        self.twin.episodes[...] = state["episodes"]
+
+
+def _specs(settings: ExplorationSettings, decisions: DecisionState) -> Specs:
+    spec, limits, lidar = settings.observation, settings.limits, settings.lidar_spec
+    return Specs(
+        parameters=decisions.parameters,
+        shield=(limits.radius_m, limits.lag_s, limits.acceleration_mps2),
+        lidar=(lidar.range_min, lidar.start, lidar.increment),
+        scales_m=np.array(spec.view_scales_m),
+        frontier_ranges_m=np.array(spec.frontier_ranges_m),
+        lidar_range_m=spec.lidar_range_m,
+        speed_mps=spec.speed_mps,
+        yaw_rate_rps=spec.yaw_rate_rps,
+        heading_axes=spec.axes == "heading",
+    )
 
 
 def _variants(level: Level, mirror: bool) -> list[Level]:

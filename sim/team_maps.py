@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.frontier import BLOCKED, PAD, refresh_kinds, refresh_states, search_scratch, update_costs
+from imagine.core.frontier import BLOCKED, PAD, has_frontier, refresh_kinds, refresh_states, search_scratch, update_costs
 from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec
 from imagine.core.raster import LIMIT, TILE, apply_marks, beam_directions, mark_scan, ray_table
 from imagine.sim.workers import Workers
@@ -29,7 +29,7 @@ class MapArrays(NamedTuple):
     many cells of its own layer it changed. `belief` int8, `states`, `kinds` and `cost` (padded planning grids, see
     `imagine.core.frontier`) are derived; `dirty` uint8 tells the tiles of a drone whose layers changed since.
     `seen` bool `[worlds, rows, columns]` is what the team has ever known, `discovered` counts the cells each drone saw
-    first. `origins` int64 are the grid's first column and row in map cells.
+    first, `frontiers` whether it knows of any. `origins` int64 are the grid's first column and row in map cells.
     """
 
     layers: NDArray[np.int8]
@@ -47,6 +47,7 @@ class MapArrays(NamedTuple):
     coverable: NDArray[np.bool_]
     discovered: NDArray[np.int64]
     gained: NDArray[np.int64]
+    frontiers: NDArray[np.bool_]
     origins: NDArray[np.int64]
 
 
@@ -103,8 +104,12 @@ class TeamMaps:
             coverable=np.zeros((worlds, rows, columns), np.bool_),
             discovered=np.zeros((worlds, drones), np.int64),
             gained=np.zeros((worlds, drones), np.int64),
+            frontiers=np.zeros((worlds, drones), np.bool_),
             origins=np.zeros((worlds, 2), np.int64),
         )
+        self.layers, self.versions, self.belief = self.arrays.layers, self.arrays.versions, self.arrays.belief
+        self.seen, self.coverable = self.arrays.seen, self.arrays.coverable
+        self.discovered, self.origins = self.arrays.discovered, self.arrays.origins
         self.coverable_cells = np.ones(worlds, np.int64)
         cells = padded[0] * padded[1]
         self.scratch = [
@@ -120,7 +125,7 @@ class TeamMaps:
         arrays = self.arrays
         for array in (
             arrays.layers, arrays.versions, arrays.clocks, arrays.belief, arrays.states, arrays.kinds, arrays.dirty,
-            arrays.seen, arrays.coverable, arrays.discovered, arrays.gained, arrays.changed,
+            arrays.seen, arrays.coverable, arrays.discovered, arrays.gained, arrays.changed, arrays.frontiers,
         ):  # fmt: skip
             array[world] = 0
         arrays.cost[world] = BLOCKED
@@ -135,11 +140,11 @@ class TeamMaps:
 
 
 @numba.njit(cache=True, nogil=True)
-def integrate_scans(world, maps, pens, ranges, poses, connected, active, kept):  # type: ignore[no-untyped-def]
+def integrate_scans(world, maps, pens, ranges, poses, places, active, kept):  # type: ignore[no-untyped-def]
     """Add the scans of one world's `active` drones to their own layers; count what nobody had seen before.
 
-    `ranges` float32 `[drones, beams]`, `poses` `[drones, 3]`, `connected` bool `[drones, drones]`: a drone leaves out
-    its returns on teammates it hears. `kept` is scratch for one scan.
+    `ranges` float32 `[drones, beams]`, `poses` `[drones, 3]`; `places` `[drones, drones, 2]` are where a drone takes
+    its teammates to be (nan: unknown), whose returns it leaves out. `kept` is scratch for one scan.
     """
     drones = maps.clocks.shape[1]
     column0, row0 = maps.origins[world, 0], maps.origins[world, 1]
@@ -149,7 +154,7 @@ def integrate_scans(world, maps, pens, ranges, poses, connected, active, kept): 
         if not active[drone]:
             continue
         x, y, yaw = poses[drone, 0], poses[drone, 1], poses[drone, 2]
-        _without_teammates(kept, ranges[drone], pens.directions, poses, drone, connected[drone], pens.range_cap)
+        _without_teammates(kept, ranges[drone], pens.directions, poses[drone], places[drone], pens.range_cap)
         marks = maps.marks[world, drone]
         row, column = mark_scan(
             marks, x, y, yaw, pens.directions, kept, pens.range_min, pens.range_cap, pens.starts, pens.offsets
@@ -172,18 +177,15 @@ def integrate_scans(world, maps, pens, ranges, poses, connected, active, kept): 
 
 
 @numba.njit(cache=True, nogil=True)
-def _without_teammates(kept, ranges, directions, poses, drone, connected, range_cap):  # type: ignore[no-untyped-def]
-    """Copy a scan with its returns on teammates the drone hears made invalid (nan)."""
+def _without_teammates(kept, ranges, directions, pose, places, range_cap):  # type: ignore[no-untyped-def]
+    """Copy a scan with its returns on teammates at `places` made invalid (nan)."""
     for beam in range(len(ranges)):
         kept[beam] = ranges[beam]
-    x, y, yaw = poses[drone, 0], poses[drone, 1], poses[drone, 2]
-    for other in range(len(poses)):
-        if other == drone or not connected[other]:
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for peer in range(len(places)):
+        dx, dy = places[peer, 0] - pose[0], places[peer, 1] - pose[1]
+        if not dx * dx + dy * dy <= (range_cap + TEAMMATE_RADIUS_M) ** 2:  # nor where it is unknown
             continue
-        dx, dy = poses[other, 0] - x, poses[other, 1] - y
-        if dx * dx + dy * dy > (range_cap + TEAMMATE_RADIUS_M) ** 2:
-            continue
-        c, s = math.cos(yaw), math.sin(yaw)
         ahead, left = c * dx + s * dy, -s * dx + c * dy
         for beam in range(len(kept)):
             r = np.float64(kept[beam])
@@ -239,6 +241,7 @@ def derive(world, maps, scratch):  # type: ignore[no-untyped-def]
                 cost, kinds, scratch.dirty, count, scratch.is_dirty,
                 (scratch.heads, scratch.entry_cell, scratch.entry_next),
             )  # fmt: skip
+            maps.frontiers[world, drone] = has_frontier(kinds)
 
 
 @numba.njit(cache=True, nogil=True)

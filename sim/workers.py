@@ -6,9 +6,8 @@ times as long to compile.
 
 from __future__ import annotations
 
-import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -21,17 +20,23 @@ class Workers:
         self.threads = threads or len(os.sched_getaffinity(0))
         self._pool = ThreadPoolExecutor(self.threads, "worlds") if self.threads > 1 else None
 
-    def over(self, count: int, kernel: Callable[..., None], *arguments: Any) -> None:
+    def over(
+        self, count: int, kernel: Callable[..., None], *arguments: Any, scratch: Sequence[Any] | None = None
+    ) -> None:
         """Run `kernel` over 0 to `count`, split into equal parts; return when all are done.
 
-        Parts must not write to the same memory. An exception of any part is raised.
+        Parts must not write to the same memory: of `scratch`, each gets one as its last argument. An exception of any
+        part is raised.
         """
-        parts = min(self.threads, count)
-        if self._pool is None or parts <= 1:
-            kernel(0, count, *arguments)
-            return
+        parts = max(1, min(self.threads, count))
         bounds = [count * part // parts for part in range(parts + 1)]
-        jobs = [self._pool.submit(kernel, first, last, *arguments) for first, last in itertools.pairwise(bounds[1:])]
-        kernel(bounds[0], bounds[1], *arguments)
+        own = [() if scratch is None else (scratch[part],) for part in range(parts)]
+        jobs = []
+        if self._pool is not None:
+            jobs = [
+                self._pool.submit(kernel, bounds[part], bounds[part + 1], *arguments, *own[part])
+                for part in range(1, parts)
+            ]
+        kernel(bounds[0], bounds[1], *arguments, *own[0])
         for job in jobs:
             job.result()
