@@ -151,22 +151,17 @@ def delayed(world, drone, history, age, substep, delay_s):  # type: ignore[no-un
     """
     late = delay_s / SUBSTEP_S
     whole = int(late)
-    part = late - whole
     since = age * SUBSTEPS + substep - whole
     newer, older = since // SUBSTEPS, (since - 1) // SUBSTEPS
-    forward, left, rate = 0.0, 0.0, 0.0
-    if newer >= 0:
-        slot = newer % HISTORY
-        forward, left = history[world, drone, slot, 0], history[world, drone, slot, 1]
-        rate = history[world, drone, slot, 2]
-    if part > 0.0 and newer != older:
-        forward, left, rate = (1.0 - part) * forward, (1.0 - part) * left, (1.0 - part) * rate
-        if older >= 0:
-            slot = older % HISTORY
-            forward += part * history[world, drone, slot, 0]
-            left += part * history[world, drone, slot, 1]
-            rate += part * history[world, drone, slot, 2]
-    return forward, left, rate
+    old = late - whole if older != newer else 0.0
+    new = 1.0 - old if newer >= 0 else 0.0
+    old = old if older >= 0 else 0.0
+    a, b = newer % HISTORY, older % HISTORY
+    return (
+        new * history[world, drone, a, 0] + old * history[world, drone, b, 0],
+        new * history[world, drone, a, 1] + old * history[world, drone, b, 1],
+        new * history[world, drone, a, 2] + old * history[world, drone, b, 2],
+    )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
