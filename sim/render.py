@@ -198,7 +198,7 @@ def _draw_links(draw: ImageDraw.ImageDraw, scene: Scene, frame: Frame) -> None:
     for a in range(len(at)):
         for b in range(a + 1, len(at)):
             ways = int(scene.linked[a, b]) + int(scene.linked[b, a])
-            if ways == 0:
+            if ways == 0 or not (scene.alive[a] and scene.alive[b]):
                 continue
             count = max(1, round(math.dist(at[a], at[b]) / dash))
             for k in range(0, count, 2 if ways == 2 else 4):

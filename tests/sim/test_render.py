@@ -145,8 +145,8 @@ def test_links_run_between_those_who_reach_each_other(world: Exploration) -> Non
     scene = take_scene(world, 0)
     poses = np.array([[1.0, 3.5, 0.0], [3.0, 3.5, 0.0]])
 
-    def bright(linked: NDArray[np.bool_]) -> int:
-        picture = Picture(changed(scene, poses=poses, linked=linked))
+    def bright(linked: NDArray[np.bool_], alive: tuple[bool, bool] = (True, True)) -> int:
+        picture = Picture(changed(scene, poses=poses, linked=linked, alive=np.array(alive)))
         return sum(max(picture.at(x, 3.5)) > 150 for x in np.linspace(1.3, 2.7, 100))
 
     nobody, both = np.zeros((2, 2), bool), ~np.eye(2, dtype=bool)
@@ -154,6 +154,7 @@ def test_links_run_between_those_who_reach_each_other(world: Exploration) -> Non
     assert bright(nobody) == 0
     assert 30 < bright(both) < 70  # dashes
     assert 10 < bright(one) < bright(both) - 10
+    assert bright(both, (True, False)) == 0  # a fallen drone hears nobody
 
 
 def test_people_and_crates_are_drawn_as_they_stand(world: Exploration) -> None:
