@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -63,29 +62,22 @@ def take_scene(exploration: Exploration, world: int, trails: Sequence[Trail] = (
         alive=exploration.alive[world].copy(),
         linked=exploration.links()[world].copy(),
         drone_radius_m=exploration.settings.limits.radius_m,
-        people=_people(level),
-        crates=_crates(level),
+        people=_people(exploration, world),
+        crates=_crates(exploration, world),
         trails=tuple(trails),
         scans=_scan_ends(exploration, world, poses) if scans else (),
     )
 
 
-def _people(level: Level) -> NDArray[np.float64]:
-    return np.array([(*person.loop[0], person.radius) for person in level.people], float).reshape(-1, 3)
+def _people(exploration: Exploration, world: int) -> NDArray[np.float64]:
+    discs = exploration.twin.mover_discs[world]
+    there: NDArray[np.float64] = discs[discs[:, 2] > 0.0]
+    return there
 
 
-def _crates(level: Level) -> tuple[NDArray[np.float64], ...]:
-    return tuple(
-        box_corners(crate.center[0], crate.center[1], math.radians(crate.yaw_deg), crate.size) for crate in level.crates
-    )
-
-
-def box_corners(x: float, y: float, yaw: float, size: tuple[float, float]) -> NDArray[np.float64]:
-    """Return the corners `[4, 2]` of a box of `size` metres centred on (x, y) and turned by `yaw`, in order."""
-    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(size) / 2.0
-    c, s = math.cos(yaw), math.sin(yaw)
-    corners: NDArray[np.float64] = half @ np.array([[c, s], [-s, c]]) + np.array([x, y])
-    return corners
+def _crates(exploration: Exploration, world: int) -> tuple[NDArray[np.float64], ...]:
+    corners = exploration.twin.mover_edges[world].reshape(-1, 4, 4)[:, :, :2]  # each edge begins at a corner
+    return tuple(crate.copy() for crate in corners if crate.any())
 
 
 def _scan_ends(exploration: Exploration, world: int, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:

@@ -180,3 +180,19 @@ def test_exploration_tells_what_can_be_seen_from_outside() -> None:
         assert told.coverage == pytest.approx(told.discovered.sum() / env.maps.coverable_cells[told.world], rel=1e-6)
         assert (told.known >= told.discovered).all()
         assert 1.0 <= told.overlap <= 2.0
+
+
+def test_contacts_are_told_by_kind_as_the_twin_counts_them() -> None:
+    explored = ExplorationSettings(
+        levels=("0",), worlds=1, drones=2, mirror=False, random_launch=False, episode_ticks=20, stop_coverage=1.0
+    )
+    env = Exploration(explored, seed=0, restart=False)
+    env.reset()
+    for _ in range(20):
+        step = env.step(np.zeros((1, 2, 2), np.float32))
+        env.twin.wall_contacts[0, 1] += 1
+        env.twin.mover_contacts[0, 0] += 2
+    (told,) = step.episodes
+    assert told.contacts_by is not None
+    assert told.contacts_by.tolist() == [[0, 0, 38], [19, 0, 0]]
+    assert told.contacts == 57

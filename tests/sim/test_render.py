@@ -169,6 +169,7 @@ def test_people_and_crates_are_drawn_as_they_stand(world: Exploration) -> None:
     assert picture.at(7.15, 3.5) == render.CRATE
     assert picture.at(7.5, 3.5) == render.UNSEEN_FLOOR
     people, crate = scene.people + np.array([0.0, -2.0, 0.0]), scene.crates[0] + np.array([1.5, 0.0])
+    assert (scene.people == world.twin.mover_discs[0]).all()
     moved = Picture(changed(scene, people=people, crates=(crate,)))
     assert moved.at(x + 0.65 * radius, y - 2.0) == render.PERSON
     assert moved.at(8.65, 3.5) == render.CRATE
