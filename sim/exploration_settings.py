@@ -6,11 +6,15 @@ from pydantic import Field, field_validator
 
 from imagine.core.config import Settings
 from imagine.core.contract import ActionSpec
-from imagine.core.lidar import PRESETS
+from imagine.core.lidar import PRESETS, LidarSpec
 from imagine.core.mapping import MapSettings
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.vehicle_limits import VehicleLimits
-from imagine.mesh_comm.settings import Protocol
+from imagine.mesh_comm.settings import MeshSettings, Protocol
+from imagine.sim.dynamics import DynamicsSettings
+from imagine.sim.lidar_model import LidarModel
+from imagine.sim.radio import RadioSettings
+from imagine.sim.reward import RewardSettings
 
 
 class ExplorationSettings(Settings):
@@ -31,12 +35,10 @@ class ExplorationSettings(Settings):
     observation: ObservationSpec = ObservationSpec()
     action: ActionSpec = ActionSpec()
     protocol: Protocol = "one-hop"
-    radio_range_m: float = Field(default=5.0, gt=0.0)
-    tiles_a_tick: int = Field(
-        default=20, ge=1, description="what 250 kbit/s carries in 0.1 s at about 150 bytes a tile"
-    )
-    reward_scale: float = Field(default=5.0, gt=0.0)
-    own_credit: float = Field(default=0.5, ge=0.0, le=1.0, description="share of the reward for own discoveries")
+    radio: RadioSettings = RadioSettings()
+    reward: RewardSettings = RewardSettings()
+    dynamics: DynamicsSettings = DynamicsSettings()
+    sensing: LidarModel = LidarModel()
 
     @field_validator("lidar")
     @classmethod
@@ -44,3 +46,13 @@ class ExplorationSettings(Settings):
         if name not in PRESETS:
             raise ValueError(f"unknown LiDAR; known: {', '.join(PRESETS)}")
         return name
+
+    @property
+    def lidar_spec(self) -> LidarSpec:
+        """The sensor that `lidar` names."""
+        return PRESETS[self.lidar]
+
+    @property
+    def mesh(self) -> MeshSettings:
+        """How the drones use their radios."""
+        return MeshSettings(protocol=self.protocol)

@@ -22,8 +22,7 @@ class EpisodeTotals:
     """What the counters of one world stand at when its episode ends; the recorder keeps none of these itself.
 
     Per drone: `discovered` int `[drones]`, coverable cells it was the first to see; `known` int `[drones]`, cells it
-    knows from its own sensor; `contacts` int `[drones]`, or `[drones, 3]` by CONTACT_KINDS; `tiles_sent` int
-    `[drones]`; `bytes_by` int `[drones, 4]` by BYTE_KINDS and `cells_by` int `[drones, 3]` by CELL_SOURCES, None where
+    knows from its own sensor; `contacts` int `[drones]`, or `[drones, 3]` by CONTACT_KINDS; `bytes_by` int `[drones, 4]` by BYTE_KINDS and `cells_by` int `[drones, 3]` by CELL_SOURCES, None where
     the radio keeps no such account. Of the team: `seen` cells, and the level's `coverable` ones.
     """
 
@@ -33,7 +32,6 @@ class EpisodeTotals:
     discovered: NDArray[np.int64]
     known: NDArray[np.int64]
     contacts: NDArray[np.int64]
-    tiles_sent: NDArray[np.int64]
     bytes_by: NDArray[np.int64] | None = None
     cells_by: NDArray[np.int64] | None = None
 
@@ -68,7 +66,6 @@ class EpisodeMetrics:
     """Cells each drone knows from its own sensor, `[drones]`."""
     contacts: int
     """Things that drones have begun to touch, over the team; two drones that meet count two."""
-    tiles_sent: NDArray[np.int64]
     link_ticks: NDArray[np.int64]
     """Ticks in which each drone was linked with at least one other, `[drones]`."""
     pair_ticks: NDArray[np.int64]
@@ -120,7 +117,7 @@ class Recorder:
         self._links = np.zeros((worlds, drones), np.int64)
         self._pairs = np.zeros((worlds, drones, drones), np.int64)
         self._alive_ticks = np.zeros((worlds, drones), np.int64)
-        self._everyone = np.ones((worlds, drones), np.bool_)
+        self._everyone, self._everywhere = np.ones((worlds, drones), np.bool_), np.ones(worlds, np.bool_)
 
     def begin(self, world: int, poses: NDArray[np.float64]) -> None:
         """Forget a world's episode and start the next one with the drones at `poses` `[drones, 2 or 3]`, metres."""
@@ -136,15 +133,17 @@ class Recorder:
         linked: NDArray[np.bool_],
         discovered: NDArray[np.int64],
         alive: NDArray[np.bool_] | None = None,
+        running: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Take what a tick brought in every world.
+        """Take what a tick brought in every world, or in those that are `running` (bool `[worlds]`).
 
         `coverage` `[worlds]` shares; `poses` `[worlds, drones, 2 or 3]`, metres; `linked` bool `[worlds, drones,
         drones]`, who reaches whom; `discovered` `[worlds, drones]`, since the episode began; `alive` bool `[worlds,
         drones]` says who still flies, everyone where it is None.
         """
         longest = _record(
-            coverage, poses, linked, discovered, self._everyone if alive is None else alive, self._lengths,
+            coverage, poses, linked, discovered, self._everyone if alive is None else alive,
+            self._everywhere if running is None else running, self._lengths,
             self._curves, self._samples, self._last, self._path, self._links, self._pairs, self._alive_ticks,
         )  # fmt: skip
         if longest == self._curves.shape[1]:
@@ -174,7 +173,6 @@ class Recorder:
             drone_curves=(samples / max(1, totals.coverable)).astype(np.float32),
             known=totals.known.copy(),
             contacts=int(totals.contacts.sum()),
-            tiles_sent=totals.tiles_sent.copy(),
             link_ticks=self._links[world].copy(),
             pair_ticks=self._pairs[world].copy(),
             alive_ticks=self._alive_ticks[world].copy(),
@@ -195,13 +193,16 @@ def first_at_least(curve: NDArray[np.float32], share: float) -> int | None:
 
 @numba.njit(cache=True, nogil=True)
 def _record(  # type: ignore[no-untyped-def]
-    coverage, poses, linked, discovered, alive, lengths, curves, samples, last, path, links, pairs, alive_ticks
+    coverage, poses, linked, discovered, alive, running, lengths, curves, samples, last, path, links, pairs, alive_ticks
 ):
     """Write one tick of every world into the recorder's arrays; return the ticks of the longest episode."""
     longest = 0
     drones = poses.shape[1]
     for world in range(len(lengths)):
         tick = lengths[world]
+        if not running[world]:
+            longest = max(longest, tick)
+            continue
         curves[world, tick] = coverage[world]
         if (tick + 1) % SAMPLE_TICKS == 0:
             for drone in range(drones):

@@ -20,8 +20,10 @@ from imagine.core.vehicle_limits import VehicleLimits
 from imagine.sim.chipmunk import addresses
 from imagine.sim.dynamics import COLUMNS, HISTORY, TICK_S, DynamicsSettings
 from imagine.sim.level import Level
+from imagine.sim.lidar_model import LidarModel
 from imagine.sim.movers import Movers
 from imagine.sim.physics import DRONES, MOVERS, TALLY_COLUMNS, WALLS, prepare_tally, step_worlds, touched
+from imagine.sim.scan_world import Sensors
 from imagine.sim.sensing import Sensing
 from imagine.sim.solids import Solids, build_space, free_space
 from imagine.sim.workers import Workers
@@ -50,6 +52,7 @@ class Twin:
         seed: int = 0,
         dynamics: DynamicsSettings | None = None,
         world_keys: Sequence[int] | None = None,
+        sensing: LidarModel | None = None,
     ) -> None:
         """Make one world for each of `levels`, its drones on the level's launch poses.
 
@@ -98,7 +101,7 @@ class Twin:
         self._solids: weakref.WeakKeyDictionary[Level, Solids] = weakref.WeakKeyDictionary()
         self._owned: dict[int, tuple[int, NDArray[np.int64], NDArray[np.int64]]] = {}
         weakref.finalize(self, _free_all, self._api, self._owned).atexit = False  # the process's end frees it all
-        self._sensing = Sensing(worlds, drones, lidar, seed, self.workers, self.world_keys)
+        self._sensing = Sensing(worlds, drones, lidar, seed, self.workers, self.world_keys, sensing)
         for world, level in enumerate(levels):
             self.set_level(world, level, level.launch_poses(drones))
 
@@ -138,6 +141,7 @@ class Twin:
         self._movers.place(world, level, rng, poses, self.limits.radius_m)
         self.levels[world] = level
         self._sensing.set_level(world, level)
+        self._sensing.randomise(world, rng)
         self.poses[world] = poses
         self.velocity[world] = 0.0
         self.contacts[world] = 0
@@ -179,6 +183,10 @@ class Twin:
                 movers.edges,
             )  # fmt: skip
         return self._arguments
+
+    def sensors(self, reach_m: float) -> Sensors:
+        """Return what kernels scan by, to `reach_m` at most; good until the next level is set."""
+        return self._sensing.sensors(reach_m)
 
     def check(self, setpoints: NDArray[np.float64]) -> None:
         """Raise InputError naming level, drone and place where a setpoint `[worlds, drones, 3]` is not finite."""
