@@ -4,9 +4,9 @@ One set of kernels serves a single drone on board and, called in a loop over wor
 Grids are row-major `[row = y, column = x]`; cell (row, column) of a grid with origin (column0, row0) covers
 `[(column + column0) * CELL, ...)` metres of the map frame.
 
-A scan becomes evidence in two steps: `mark_scan` draws it into a square of whole tiles of marks around the drone, one
-mark a cell, and `apply_marks` adds the marks to a layer. The twin applies the same marks to the layers of those who
-hear the scan. Whole tiles, since loops over 32 bytes at an even address compile to a few vector instructions.
+A scan becomes evidence in two steps: `mark_scan` draws it into a sheet of marks around the drone, one mark a cell, and
+`apply_marks` adds the marks to a layer. The twin applies the same marks to the layers of those who hear the scan. A
+sheet is some whole tiles wide, since loops over 32 bytes at an even address compile to a few vector instructions.
 """
 
 from __future__ import annotations
@@ -37,28 +37,33 @@ _LARGEST_TABLE_REACH = 64  # cells; beyond it the lines are traced anew, for a t
 
 
 class RayTable(NamedTuple):
-    """The Bresenham lines from one cell to all cells at most `reach` away, as offsets in a square of marks.
+    """The Bresenham lines from one cell to all cells at most `reach` away, as offsets in a sheet of marks.
 
-    `side` is the edge of that square, in cells: whole tiles that hold the reach wherever in a tile the drone is. The
-    line to (row, column) from the drone runs through the drone's own flat cell plus `offsets[starts[k] : starts[k +
+    `width` is that of the sheet, in cells: whole tiles that hold the reach wherever in a tile the drone is; its rows
+    are the `2 reach + 1` around the drone. The line to (row, column) from the drone runs through the drone's own flat cell plus `offsets[starts[k] : starts[k +
     1]]` (int16), k = (row + reach) (2 reach + 1) + column + reach, its last cell left out. Both are empty where the
     reach is too long for a table.
     """
 
     reach: int
-    side: int
+    width: int
     starts: NDArray[np.int32]
     offsets: NDArray[np.int16]
+
+    @property
+    def sheet(self) -> tuple[int, int]:
+        """Rows and columns of a sheet of marks."""
+        return 2 * self.reach + 1, self.width
 
 
 @lru_cache(maxsize=8)
 def ray_table(range_cap: float) -> RayTable:
     """Return the lines that scans cut at `range_cap` metres are drawn along."""
     reach = math.ceil(range_cap / CELL) + 1
-    side = TILE * math.ceil((2 * reach + TILE) / TILE)
+    width = TILE * math.ceil((2 * reach + TILE) / TILE)
     if reach > _LARGEST_TABLE_REACH:
-        return RayTable(reach, side, np.empty(0, np.int32), np.empty(0, np.int16))
-    return RayTable(reach, side, *_trace_all(reach, side))
+        return RayTable(reach, width, np.empty(0, np.int32), np.empty(0, np.int16))
+    return RayTable(reach, width, *_trace_all(reach, width))
 
 
 @lru_cache(maxsize=32)
@@ -71,7 +76,7 @@ def beam_directions(start: float, increment: float, beams: int) -> NDArray[np.fl
 
 
 @numba.njit(cache=True, nogil=True)
-def _trace(line, side, row, column):  # type: ignore[no-untyped-def]
+def _trace(line, width, row, column):  # type: ignore[no-untyped-def]
     """Write the offsets of the Bresenham line to the cell `row`, `column` away, without the last; count them.
 
     Bresenham 1965, in its form for all octants.
@@ -83,7 +88,7 @@ def _trace(line, side, row, column):  # type: ignore[no-untyped-def]
     at_row, at_column = 0, 0
     count = 0
     while at_row != row or at_column != column:
-        line[count] = at_row * side + at_column
+        line[count] = at_row * width + at_column
         count += 1
         doubled = 2 * error
         if doubled > -d_row:
@@ -96,7 +101,7 @@ def _trace(line, side, row, column):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _trace_all(reach, side):  # type: ignore[no-untyped-def]
+def _trace_all(reach, width):  # type: ignore[no-untyped-def]
     """Return the `starts` and `offsets` of a ray table."""
     ends = 2 * reach + 1
     starts = np.zeros(ends * ends + 1, np.int32)
@@ -105,7 +110,7 @@ def _trace_all(reach, side):  # type: ignore[no-untyped-def]
     total = 0
     for row in range(ends):
         for column in range(ends):
-            count = _trace(line, side, row - reach, column - reach)
+            count = _trace(line, width, row - reach, column - reach)
             for k in range(count):
                 offsets[total + k] = line[k]
             total += count
@@ -117,23 +122,22 @@ def _trace_all(reach, side):  # type: ignore[no-untyped-def]
 def mark_scan(  # type: ignore[no-untyped-def]
     marks, x, y, yaw, directions, ranges, range_min, range_cap, starts, offsets
 ):
-    """Draw a scan into `marks` (int8 `[side, side]`, see `RayTable`): MISS, HIT, or 0 where no beam went.
+    """Draw a scan into `marks` (int8, a `RayTable.sheet`): MISS, HIT, or 0 where no beam went.
 
-    Return (row, column), in cells of the map frame, of its first cell, the corner of a tile. A cell takes one mark, a
+    Return (row, column), in cells of the map frame, of its first cell; the column is a tile's first. A cell takes one mark, a
     hit before a miss, so near cells crossed by many beams are not counted many times. Beams run along Bresenham lines
     and are cut at `range_cap` metres; inf frees the whole length, nan and what is nearer than `range_min` say nothing.
     Ranges are rounded to RANGE_STEP_M. Pose in metres and radians; `directions` of `beam_directions`; `starts` and
     `offsets` are the ray table's.
     """
-    side = marks.shape[0]
-    reach = math.ceil(range_cap / CELL) + 1
-    ends = 2 * reach + 1
+    ends, width = marks.shape
+    reach = ends // 2
     flat = marks.ravel()
     flat[:] = 0
     own_column, own_row = math.floor(x / CELL), math.floor(y / CELL)
     first_column = (own_column - reach) // TILE * TILE
-    first_row = (own_row - reach) // TILE * TILE
-    own = (own_row - first_row) * side + own_column - first_column
+    first_row = own_row - reach
+    own = reach * width + own_column - first_column
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     hits = np.empty(len(ranges), np.int32)
     hit_count = 0
@@ -153,7 +157,7 @@ def mark_scan(  # type: ignore[no-untyped-def]
         column = math.floor((x + length * (cos_yaw * cos_beam - sin_yaw * sin_beam)) / CELL) - own_column
         row = math.floor((y + length * (sin_yaw * cos_beam + cos_yaw * sin_beam)) / CELL) - own_row
         if is_hit:
-            hits[hit_count] = own + row * side + column
+            hits[hit_count] = own + row * width + column
             hit_count += 1
         end = (row + reach) * ends + column + reach
         if end == last_end:
@@ -163,7 +167,7 @@ def mark_scan(  # type: ignore[no-untyped-def]
             for k in range(starts[end], starts[end + 1]):
                 flat[np.uint32(own + offsets[k])] = MISS
         else:
-            for k in range(_trace(line, side, row, column)):
+            for k in range(_trace(line, width, row, column)):
                 flat[np.uint32(own + line[k])] = MISS
     for k in range(hit_count):  # last, since they win over misses of the same scan
         flat[np.uint32(hits[k])] = HIT
@@ -174,20 +178,18 @@ def mark_scan(  # type: ignore[no-untyped-def]
 def apply_marks(cells, marks, row0, column0, touched):  # type: ignore[no-untyped-def]
     """Add marks to `cells` (int8 `[rows, columns]`, whole tiles), clamped; return how many cells changed.
 
-    The marks' first cell is (row0, column0) of the grid, the corner of a tile; marks beyond the grid are left out.
-    `touched` (bool `[rows // TILE, columns // TILE]`) is set for tiles where a cell changed.
+    The marks' first cell is (row0, column0) of the grid, the column a tile's first; marks beyond the grid are left
+    out. `touched` (bool `[rows // TILE, columns // TILE]`) is set for tiles where a cell changed.
     """
     tile_rows, tile_columns = touched.shape
     changed = 0
-    for i in range(marks.shape[0] // TILE):
-        tile_row = row0 // TILE + i
-        if not 0 <= tile_row < tile_rows:
-            continue
+    for tile_row in range(max(0, row0 // TILE), min(tile_rows, (row0 + marks.shape[0] - 1) // TILE + 1)):
+        first, last = max(row0, tile_row * TILE), min(row0 + marks.shape[0], (tile_row + 1) * TILE)
         for j in range(marks.shape[1] // TILE):
             tile_column = column0 // TILE + j
             if not 0 <= tile_column < tile_columns:
                 continue
-            differing = add_tile_marks(cells, tile_row * TILE, tile_column * TILE, marks, i * TILE, j * TILE)
+            differing = _add(cells, first, last, tile_column * TILE, marks, first - row0, j * TILE)
             if differing > 0:
                 touched[tile_row, tile_column] = True
                 changed += differing
@@ -195,11 +197,11 @@ def apply_marks(cells, marks, row0, column0, touched):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, nogil=True)
-def add_tile_marks(cells, row, column, marks, mark_row, mark_column):  # type: ignore[no-untyped-def]
-    """Add the marks of one tile at (mark_row, mark_column) to the cells at (row, column); return how many changed."""
+def _add(cells, first, last, column, marks, mark_row, mark_column):  # type: ignore[no-untyped-def]
+    """Add a tile's width of marks to rows first to last of the cells; return how many changed."""
     changed = 0
-    for i in range(TILE):
-        line, mark_line = cells[row + i], marks[mark_row + i]
+    for i in range(last - first):
+        line, mark_line = cells[first + i], marks[mark_row + i]
         differing = np.int8(0)
         # Bytes, conditional expressions and indices without a sign: this compiles to a few vector instructions.
         for j in range(TILE):
@@ -232,7 +234,7 @@ def integrate_scan(
     See `mark_scan` and `apply_marks`; (column0, row0) is the grid's origin in cells of the map frame.
     """
     table = ray_table(range_cap)
-    marks = np.empty((table.side, table.side), np.int8)
+    marks = np.empty(table.sheet, np.int8)
     directions = beam_directions(start, increment, len(ranges))
     first_row, first_column = mark_scan(
         marks, x, y, yaw, directions, ranges, range_min, range_cap, table.starts, table.offsets

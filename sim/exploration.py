@@ -6,7 +6,7 @@ new scans become evidence, maps over the radio, observations and reward.
 
 from __future__ import annotations
 
-import time
+import ctypes
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,10 +22,8 @@ from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
 from imagine.sim.decision_state import DecisionState
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.exploration_tick import (
-    ALL_STAGES,
     FLYING,
     LAUNCHING,
-    OBSERVE,
     STAGE_NAMES,
     WAITING,
     Batch,
@@ -76,8 +74,7 @@ class Exploration:
     """A batch of worlds being explored; finished worlds start anew by themselves.
 
     `alive` bool `[worlds, drones]`; `ticks` `[worlds]` of the episodes in progress; `estimates` `[worlds, drones, 3]`
-    what drones take their poses to be. With `stage_seconds` set to a dict of names, steps run stage by stage and add
-    up how long each took; slower, for profiles.
+    what drones take their poses to be.
     """
 
     dt = TICK_S
@@ -122,7 +119,6 @@ class Exploration:
         self.ranges = np.full((worlds, drones, self.lidar.beams), np.inf, np.float32)
         """The newest turn of every drone's LiDAR, `[worlds, drones, beams]`: metres, inf no return, nan invalid."""
         self.estimates = self.twin.poses
-        self.stage_seconds: dict[str, float] | None = None
         self._specs = _specs(settings, self.decisions)
         self._sight_m = max(cap + 2.0 * TEAMMATE_RADIUS_M, settings.observation.lidar_range_m)
         batch = self._new_batch(keys)
@@ -216,7 +212,7 @@ class Exploration:
         touched = self.twin.contacts.copy()
         flying = self.alive & running[:, None]
         self.ticks += running
-        self._run(np.where(running, FLYING, WAITING), ALL_STAGES if observe else ALL_STAGES & ~OBSERVE)
+        self._run(np.where(running, FLYING, WAITING), observe)
         gained = np.where(running[:, None], self.maps.arrays.gained, 0)
         begun = self.twin.contacts - touched
         coverage = self.maps.coverage()
@@ -229,26 +225,32 @@ class Exploration:
         running &= ~over
         return earned
 
-    def _run(self, modes: NDArray[np.int64], stages: int = ALL_STAGES) -> None:
-        """Run stages of a tick in all worlds, as `modes` says for each."""
+    def _run(self, modes: NDArray[np.int64], observe: bool = True) -> None:
+        """Run a tick in all worlds, as `modes` says for each."""
         twin, batch = self.twin, self._batches[self._turn]
         batch.modes[...] = modes
-        arguments = (
-            batch, self._specs, twin.sensors(self._sight_m), twin.kernel_args(), twin.mover_discs, twin.mover_edges,
-            twin.limits.radius_m,
+        twin.workers.over(
+            self.worlds, tick_worlds, observe, batch, self._specs, twin.sensors(self._sight_m), twin.kernel_args(),
+            twin.mover_discs, twin.mover_edges, twin.limits.radius_m, scratch=self.maps.scratch,
         )  # fmt: skip
-        if self.stage_seconds is None:
-            twin.workers.over(self.worlds, tick_worlds, stages, *arguments, scratch=self.maps.scratch)
-        else:
-            for index, name in enumerate(STAGE_NAMES):
-                began = time.perf_counter()
-                twin.workers.over(self.worlds, tick_worlds, stages & 1 << index, *arguments, scratch=self.maps.scratch)
-                self.stage_seconds[name] = self.stage_seconds.get(name, 0.0) + time.perf_counter() - began
         twin.ticks += 1
         active = modes != WAITING
         self.decisions.sense(self.estimates, self.links(), self.maps.origins, self.alive, active, self.dt)
-        if stages & OBSERVE:
+        if observe:
             self.decisions.fill(batch.views, batch.motion, self.estimates, self.maps.origins)
+
+    def time_stages(self) -> None:
+        """Begin to add up how long each stage of a tick takes, see `stage_seconds`."""
+        address = ctypes.cast(ctypes.CDLL(None).clock_gettime, ctypes.c_void_p).value
+        for scratch in self.maps.scratch:
+            scratch.clock[0] = address or 0
+            scratch.nanoseconds[:] = 0
+
+    @property
+    def stage_seconds(self) -> dict[str, float]:
+        """How long each stage of a tick took since `time_stages`, summed over threads; all 0 where that was not called."""
+        total = sum(scratch.nanoseconds for scratch in self.maps.scratch)
+        return {name: float(total[stage]) * 1e-9 for stage, name in enumerate(STAGE_NAMES)}
 
     def links(self) -> NDArray[np.bool_]:
         """Tell who exchanges maps with whom now, bool `[worlds, drones, drones]`; nobody under the protocol `off`."""

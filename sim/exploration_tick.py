@@ -19,15 +19,16 @@ from imagine.core.shield import shield_kernel
 from imagine.sim.air import AirState
 from imagine.sim.air_receive import deliver, peer_place
 from imagine.sim.air_send import send
+from imagine.sim.chipmunk import call_address
 from imagine.sim.physics import step_worlds
 from imagine.sim.scan_world import scan_world
 from imagine.sim.team_maps import MapArrays, Pens, derive, integrate_scans
 
 WAITING, FLYING, LAUNCHING = 0, 1, 2
 """What a world does in a tick: nothing, all stages, or all but flying, for what is seen at the launch."""
-FLY, SCAN, HEAR, MAP, DERIVE, OBSERVE, SPEAK = (1 << stage for stage in range(7))
-ALL_STAGES = (1 << 7) - 1
-STAGE_NAMES = ("physics", "rays", "hear", "integration", "belief and field", "views", "speak")
+PHYSICS, RAYS, HEARING, MAPPING, DERIVING, OBSERVING, SPEAKING = range(7)
+STAGE_NAMES = ("physics", "rays", "radio in", "integration", "belief and field", "views", "radio out")
+_CLOCK_MONOTONIC = 1  # of Linux's <time.h>
 
 
 class Specs(NamedTuple):
@@ -74,8 +75,8 @@ class Batch(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def tick_worlds(first, last, stages, batch, specs, sensors, flight, discs, edges, radius, scratch):  # type: ignore[no-untyped-def]
-    """Run the `stages` (bits) of a tick in worlds first to last, each as its mode says.
+def tick_worlds(first, last, observes, batch, specs, sensors, flight, discs, edges, radius, scratch):  # type: ignore[no-untyped-def]
+    """Run a tick in worlds first to last, each as its mode says; fill observations only where one `observes`.
 
     `sensors` are `Sensing.sensors()`, `flight` is `Twin.kernel_args()`, `discs` and `edges` what moves; `scratch` is
     this thread's own.
@@ -84,33 +85,47 @@ def tick_worlds(first, last, stages, batch, specs, sensors, flight, discs, edges
         mode = batch.modes[world]
         if mode == WAITING:
             continue
-        if stages & FLY and mode == FLYING:
+        began = _lap(scratch, -1, 0)
+        if mode == FLYING:
             _aim(world, batch, specs)
             step_worlds(world, world + 1, batch.setpoints, *flight)
-        if stages & SCAN:
-            batch.scans[world] += 1
-            scan_world(
-                world, batch.ranges, sensors, batch.poses, batch.velocity, batch.alive, discs, edges, radius,
-                batch.scans[world],
-            )  # fmt: skip
-        if stages & HEAR:
-            _hear(world, batch, sensors)
-        if stages & MAP:
-            integrate_scans(
-                world, batch.maps, batch.pens, batch.ranges[world], batch.estimates[world], batch.places[world],
-                batch.alive[world], scratch.kept,
-            )  # fmt: skip
-        if stages & DERIVE:
-            derive(world, batch.maps, scratch)
-        if stages & OBSERVE:
+        began = _lap(scratch, PHYSICS, began)
+        batch.scans[world] += 1
+        scan_world(
+            world, batch.ranges, sensors, batch.poses, batch.velocity, batch.alive, discs, edges, radius,
+            batch.scans[world],
+        )  # fmt: skip
+        began = _lap(scratch, RAYS, began)
+        _hear(world, batch, sensors)
+        began = _lap(scratch, HEARING, began)
+        integrate_scans(
+            world, batch.maps, batch.pens, batch.ranges[world], batch.estimates[world], batch.places[world],
+            batch.alive[world], scratch,
+        )  # fmt: skip
+        began = _lap(scratch, MAPPING, began)
+        derive(world, batch.maps, scratch)
+        began = _lap(scratch, DERIVING, began)
+        if observes:
             _observe(world, batch, specs)
-        if stages & SPEAK:
-            maps = batch.maps
-            send(
-                batch.air, world, batch.ticks[world], batch.estimates[world], batch.velocity[world],
-                batch.ranges[world], maps.marks[world], maps.corners[world], maps.clocks[world], maps.layers[world],
-                maps.versions[world],
-            )  # fmt: skip
+        began = _lap(scratch, OBSERVING, began)
+        maps = batch.maps
+        send(
+            batch.air, world, batch.ticks[world], batch.estimates[world], batch.velocity[world], batch.ranges[world],
+            scratch.marks, scratch.corners, maps.clocks[world], maps.layers[world], maps.versions[world],
+        )  # fmt: skip
+        _lap(scratch, SPEAKING, began)
+
+
+@numba.njit(cache=True, nogil=True)
+def _lap(scratch, stage, began):  # type: ignore[no-untyped-def]
+    """Add the time since `began` (ns) to a stage and return what it is now; do nothing where no clock is set."""
+    if scratch.clock[0] == 0:
+        return 0
+    call_address(scratch.clock[0], (_CLOCK_MONOTONIC, scratch.lap.ctypes.data))
+    now = scratch.lap[0] * 1_000_000_000 + scratch.lap[1]
+    if stage >= 0:
+        scratch.nanoseconds[stage] += now - began
+    return now
 
 
 @numba.njit(cache=True, nogil=True)

@@ -20,13 +20,16 @@ from imagine.core.raster import LIMIT, TILE, apply_marks, beam_directions, mark_
 from imagine.sim.workers import Workers
 
 
+STAGES = 8
+"""How many parts of a tick a thread may time."""
+
+
 class MapArrays(NamedTuple):
     """The maps of all worlds, as kernels take them.
 
     `layers` int8 `[worlds, drones, sources, rows, columns]` is what a drone holds of each source, `versions` uint32
-    the version of each tile, `clocks` uint32 the greatest version a drone has given. `marks` int8 is each drone's
-    newest scan drawn in whole tiles, `corners` int64 the grid row and column of their first cell, `changed` int64 how
-    many cells of its own layer it changed. `belief` int8, `states`, `kinds` and `cost` (padded planning grids, see
+    the version of each tile, `clocks` uint32 the greatest version a drone has given, `changed` int64 how many cells of
+    its own layer the newest scan changed. `belief` int8, `states`, `kinds` and `cost` (padded planning grids, see
     `imagine.core.frontier`) are derived; `dirty` uint8 tells the tiles of a drone whose layers changed since.
     `seen` bool `[worlds, rows, columns]` is what the team has ever known, `discovered` counts the cells each drone saw
     first, `frontiers` whether it knows of any. `origins` int64 are the grid's first column and row in map cells.
@@ -35,8 +38,6 @@ class MapArrays(NamedTuple):
     layers: NDArray[np.int8]
     versions: NDArray[np.uint32]
     clocks: NDArray[np.uint32]
-    marks: NDArray[np.int8]
-    corners: NDArray[np.int64]
     changed: NDArray[np.int64]
     belief: NDArray[np.int8]
     states: NDArray[np.uint8]
@@ -62,8 +63,18 @@ class Pens(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What one thread works with while it brings frontier fields up to date."""
+    """What one thread works with, one world after another, so that it stays in the cache.
 
+    `marks` int8 `[drones, rows, width]` are the newest scans drawn, `corners` int64 `[drones, 2]` the grid
+    row and column of their first cell. `clock` holds the address of C's clock_gettime, or 0 where nothing is timed;
+    `lap` is what it writes, `nanoseconds` what each stage took.
+    """
+
+    marks: NDArray[np.int8]
+    corners: NDArray[np.int64]
+    clock: NDArray[np.int64]
+    lap: NDArray[np.int64]
+    nanoseconds: NDArray[np.int64]
     dirty: NDArray[np.int32]
     is_dirty: NDArray[np.uint8]
     heads: NDArray[np.int32]
@@ -92,8 +103,6 @@ class TeamMaps:
             layers=np.zeros((worlds, drones, drones, rows, columns), np.int8),
             versions=np.zeros((worlds, drones, drones, *tiles), np.uint32),
             clocks=np.zeros((worlds, drones), np.uint32),
-            marks=np.zeros((worlds, drones, table.side, table.side), np.int8),
-            corners=np.zeros((worlds, drones, 2), np.int64),
             changed=np.zeros((worlds, drones), np.int64),
             belief=np.zeros((worlds, drones, rows, columns), np.int8),
             states=np.zeros((worlds, drones, *padded), np.uint8),
@@ -114,7 +123,8 @@ class TeamMaps:
         cells = padded[0] * padded[1]
         self.scratch = [
             Scratch(
-                np.empty(cells, np.int32), np.zeros(cells, np.uint8), *search_scratch(cells),
+                np.zeros((drones, *table.sheet), np.int8), np.zeros((drones, 2), np.int64),
+                np.zeros(1, np.int64), np.zeros(2, np.int64), np.zeros(STAGES, np.int64), np.empty(cells, np.int32), np.zeros(cells, np.uint8), *search_scratch(cells),
                 np.empty((tiles[0] * tiles[1], 4), np.int64), np.empty(lidar.beams, np.float32),
             )
             for _ in range(workers.threads)
@@ -140,11 +150,11 @@ class TeamMaps:
 
 
 @numba.njit(cache=True, nogil=True)
-def integrate_scans(world, maps, pens, ranges, poses, places, active, kept):  # type: ignore[no-untyped-def]
+def integrate_scans(world, maps, pens, ranges, poses, places, active, scratch):  # type: ignore[no-untyped-def]
     """Add the scans of one world's `active` drones to their own layers; count what nobody had seen before.
 
     `ranges` float32 `[drones, beams]`, `poses` `[drones, 3]`; `places` `[drones, drones, 2]` are where a drone takes
-    its teammates to be (nan: unknown), whose returns it leaves out. `kept` is scratch for one scan.
+    its teammates to be (nan: unknown), whose returns it leaves out. Leaves the marks in `scratch`.
     """
     drones = maps.clocks.shape[1]
     column0, row0 = maps.origins[world, 0], maps.origins[world, 1]
@@ -154,12 +164,12 @@ def integrate_scans(world, maps, pens, ranges, poses, places, active, kept):  # 
         if not active[drone]:
             continue
         x, y, yaw = poses[drone, 0], poses[drone, 1], poses[drone, 2]
+        kept, marks = scratch.kept, scratch.marks[drone]
         _without_teammates(kept, ranges[drone], pens.directions, poses[drone], places[drone], pens.range_cap)
-        marks = maps.marks[world, drone]
         row, column = mark_scan(
             marks, x, y, yaw, pens.directions, kept, pens.range_min, pens.range_cap, pens.starts, pens.offsets
         )
-        maps.corners[world, drone, 0], maps.corners[world, drone, 1] = row - row0, column - column0
+        scratch.corners[drone, 0], scratch.corners[drone, 1] = row - row0, column - column0
         cells, dirty, versions = maps.layers[world, drone, drone], maps.dirty[world, drone], maps.versions[world, drone]
         touched = np.zeros(dirty.shape, np.bool_)
         changed = apply_marks(cells, marks, row - row0, column - column0, touched)
