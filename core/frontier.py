@@ -370,10 +370,11 @@ def search_scratch(cells: int) -> tuple[NDArray[np.int32], NDArray[np.int32], ND
 @numba.njit(cache=True, nogil=True)
 def has_frontier(kinds):  # type: ignore[no-untyped-def]
     """Tell whether any cell is a frontier."""
-    for kind in kinds.ravel():
-        if kind & np.uint8(_FRONTIER):
-            return True
-    return False
+    flat = kinds.ravel()
+    cell = 0
+    while cell < len(flat) and not flat[cell] & np.uint8(_FRONTIER):
+        cell += 1
+    return cell < len(flat)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -181,13 +181,13 @@ def _fill_turned(  # type: ignore[no-untyped-def]
             occupancy[i, j], frontier[i, j] = 0.0, 1.0
             if row < 0 or column < 0 or row + block > rows or column + block > columns:
                 continue
-            total, strongest = 0, 0
+            total, strongest = np.int64(0), np.int64(0)
             for r in range(row, row + block):
                 for c in range(column, column + block):
                     total += belief[r, c]
                     strongest = max(strongest, np.int64(belief[r, c]))
             occupancy[i, j] = np.float32(strongest * block * block if strongest > 0 else total) * per_limit
-            least = FAR
+            least = np.int64(FAR)
             for r in range((row >> 1) + PAD, (row >> 1) + PAD + plan_block):
                 for c in range((column >> 1) + PAD, (column >> 1) + PAD + plan_block):
                     if 0 <= cost[r, c] < least:

@@ -41,7 +41,7 @@ def _nearest_valued(cost, row, column):  # type: ignore[no-untyped-def]
     """Return the planning cell to start from: the drone's own, or the one of least cost within two cells."""
     rows, columns = cost.shape
     for ring in range(3):
-        best_row, best_column, best = -1, -1, FAR
+        best_row, best_column, best = -1, -1, np.int64(FAR)
         for i in range(max(0, row - ring), min(rows, row + ring + 1)):
             for j in range(max(0, column - ring), min(columns, column + ring + 1)):
                 if 0 <= cost[i, j] < best:

@@ -40,9 +40,9 @@ class RayTable(NamedTuple):
     """The Bresenham lines from one cell to all cells at most `reach` away, as offsets in a sheet of marks.
 
     `width` is that of the sheet, in cells: whole tiles that hold the reach wherever in a tile the drone is; its rows
-    are the `2 reach + 1` around the drone. The line to (row, column) from the drone runs through the drone's own flat cell plus `offsets[starts[k] : starts[k +
-    1]]` (int16), k = (row + reach) (2 reach + 1) + column + reach, its last cell left out. Both are empty where the
-    reach is too long for a table.
+    are the `2 reach + 1` around the drone. The line to (row, column) from the drone runs through the drone's own flat
+    cell plus `offsets[starts[k] : starts[k + 1]]` (int16), k = (row + reach) (2 reach + 1) + column + reach, its last
+    cell left out. Both are empty where the reach is too long for a table.
     """
 
     reach: int
@@ -124,10 +124,10 @@ def mark_scan(  # type: ignore[no-untyped-def]
 ):
     """Draw a scan into `marks` (int8, a `RayTable.sheet`): MISS, HIT, or 0 where no beam went.
 
-    Return (row, column), in cells of the map frame, of its first cell; the column is a tile's first. A cell takes one mark, a
-    hit before a miss, so near cells crossed by many beams are not counted many times. Beams run along Bresenham lines
-    and are cut at `range_cap` metres; inf frees the whole length, nan and what is nearer than `range_min` say nothing.
-    Ranges are rounded to RANGE_STEP_M. Pose in metres and radians; `directions` of `beam_directions`; `starts` and
+    Return (row, column), in cells of the map frame, of its first cell; the column is a tile's first. A cell takes one
+    mark, a hit before a miss, so near cells crossed by many beams are not counted many times. Beams run along
+    Bresenham lines and are cut at `range_cap` metres; inf frees the whole length, nan and what is nearer than
+    `range_min` say nothing. Ranges are rounded to RANGE_STEP_M. Pose in metres and radians; `directions` of `beam_directions`; `starts` and
     `offsets` are the ray table's.
     """
     ends, width = marks.shape

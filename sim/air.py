@@ -184,9 +184,7 @@ class Air:
         return math.ceil(sum(array.nbytes for array in arrays) / (worlds * drones))
 
 
-def _rules(
-    radio: RadioSettings, mesh: MeshSettings, lidar: LidarSpec, range_cap_m: float, tick_s: float
-) -> AirRules:
+def _rules(radio: RadioSettings, mesh: MeshSettings, lidar: LidarSpec, range_cap_m: float, tick_s: float) -> AirRules:
     return AirRules(
         ticks_per_s=1.0 / tick_s,
         shares=mesh.protocol != "off",

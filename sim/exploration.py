@@ -89,7 +89,7 @@ class Exploration:
         """Load the levels. Equal settings and seed give equal runs, and `reset` starts the first episodes.
 
         Without `restart` a finished world stays as it ended until `reset`. All that is random in a world depends on
-        `seed` and its key (default: its index) alone, so world k of a batch equals a batch of one with `world_keys=[k]`.
+        `seed` and its key (default: its index) alone: world k of a batch equals a batch of one with `world_keys=[k]`.
         """
         self.settings = settings
         self._restarts = restart
@@ -220,7 +220,9 @@ class Exploration:
         earned = rewards(gained, begun, flying, self.maps.coverable_cells, self.settings.reward, self._swept, completed)
         self.alive[...] = np.where(running[:, None], survivors(self.alive, begun, self.settings.reward), self.alive)
         self._recorder.record(coverage, self.twin.poses, self.links(), self.maps.discovered, self.alive, running)
-        self._idle[...] = np.where(running, np.where(self.maps.arrays.frontiers.any(axis=1), 0, self._idle + 1), self._idle)
+        self._idle[...] = np.where(
+            running, np.where(self.maps.arrays.frontiers.any(axis=1), 0, self._idle + 1), self._idle
+        )
         over = completed | (self.ticks >= self._limit) | (self._idle >= _IDLE_TICKS) | ~self.alive.any(axis=1)
         running &= ~over
         return earned
@@ -248,8 +250,8 @@ class Exploration:
 
     @property
     def stage_seconds(self) -> dict[str, float]:
-        """How long each stage of a tick took since `time_stages`, summed over threads; all 0 where that was not called."""
-        total = sum(scratch.nanoseconds for scratch in self.maps.scratch)
+        """How long each stage of a tick took since `time_stages`, summed over threads; 0 without that call."""
+        total = np.sum([scratch.nanoseconds for scratch in self.maps.scratch], axis=0)
         return {name: float(total[stage]) * 1e-9 for stage, name in enumerate(STAGE_NAMES)}
 
     def links(self) -> NDArray[np.bool_]:
@@ -263,7 +265,9 @@ class Exploration:
     def _metrics(self, world: int) -> EpisodeMetrics:
         maps, twin, own = self.maps, self.twin, range(self.drones)
         for drone in own:
-            claim_own(self.air.state, world, drone, maps.layers[world, drone, drone], maps.versions[world, drone, drone])
+            claim_own(
+                self.air.state, world, drone, maps.layers[world, drone, drone], maps.versions[world, drone, drone]
+            )
         totals = EpisodeTotals(
             level=twin.levels[world].name,
             coverable=int(maps.coverable_cells[world]),

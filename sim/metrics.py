@@ -22,8 +22,9 @@ class EpisodeTotals:
     """What the counters of one world stand at when its episode ends; the recorder keeps none of these itself.
 
     Per drone: `discovered` int `[drones]`, coverable cells it was the first to see; `known` int `[drones]`, cells it
-    knows from its own sensor; `contacts` int `[drones]`, or `[drones, 3]` by CONTACT_KINDS; `bytes_by` int `[drones, 4]` by BYTE_KINDS and `cells_by` int `[drones, 3]` by CELL_SOURCES, None where
-    the radio keeps no such account. Of the team: `seen` cells, and the level's `coverable` ones.
+    knows from its own sensor; `contacts` int `[drones]`, or `[drones, 3]` by CONTACT_KINDS; `bytes_by` int
+    `[drones, 4]` by BYTE_KINDS and `cells_by` int `[drones, 3]` by CELL_SOURCES, None where the radio keeps no such
+    account. Of the team: `seen` cells, and the level's `coverable` ones.
     """
 
     level: str

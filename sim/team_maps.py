@@ -14,11 +14,18 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.frontier import BLOCKED, PAD, has_frontier, refresh_kinds, refresh_states, search_scratch, update_costs
+from imagine.core.frontier import (
+    BLOCKED,
+    PAD,
+    has_frontier,
+    refresh_kinds,
+    refresh_states,
+    search_scratch,
+    update_costs,
+)
 from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec
 from imagine.core.raster import LIMIT, TILE, apply_marks, beam_directions, mark_scan, ray_table
 from imagine.sim.workers import Workers
-
 
 STAGES = 8
 """How many parts of a tick a thread may time."""
@@ -123,8 +130,9 @@ class TeamMaps:
         cells = padded[0] * padded[1]
         self.scratch = [
             Scratch(
-                np.zeros((drones, *table.sheet), np.int8), np.zeros((drones, 2), np.int64),
-                np.zeros(1, np.int64), np.zeros(2, np.int64), np.zeros(STAGES, np.int64), np.empty(cells, np.int32), np.zeros(cells, np.uint8), *search_scratch(cells),
+                np.zeros((drones, *table.sheet), np.int8), np.zeros((drones, 2), np.int64), np.zeros(1, np.int64),
+                np.zeros(2, np.int64), np.zeros(STAGES, np.int64),
+                np.empty(cells, np.int32), np.zeros(cells, np.uint8), *search_scratch(cells),
                 np.empty((tiles[0] * tiles[1], 4), np.int64), np.empty(lidar.beams, np.float32),
             )
             for _ in range(workers.threads)
@@ -208,7 +216,7 @@ def _without_teammates(kept, ranges, directions, pose, places, range_cap):  # ty
 @numba.njit(cache=True, nogil=True)
 def _see(cells, seen, coverable, tile_row, tile_column):  # type: ignore[no-untyped-def]
     """Mark what is known in a tile as seen; return how many coverable cells nobody had seen before."""
-    fresh = 0
+    fresh = np.int64(0)
     for i in range(TILE):
         line, seen_line = cells[tile_row * TILE + i], seen[tile_row * TILE + i]
         coverable_line = coverable[tile_row * TILE + i]

@@ -6,10 +6,7 @@ As a script it flies all that `sim/odometry_drift.py` is fitted to and prints th
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
