@@ -8,27 +8,51 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from imagine.core.config import Settings
+from imagine.sim.propagation import Propagation, disc, fill_reach, path_loss
 
 GROUND = 0
 """Station number of the ground station; drones count from 1."""
 
 
 class RadioSettings(Settings):
-    """The radio's limits: metres, bits per second, seconds, bytes; loss is a probability."""
+    """The radio's limits: metres, decibels, bits per second, seconds, bytes; loss is a probability.
 
-    range_m: float = Field(default=5.0, gt=0.0, description="distance at which two drones still hear each other")
+    `model` disc: heard within `range_m`, through any wall. `model` path-loss: heard while the received power is at
+    least `threshold_dbm`; the path has `exponent_clear` in sight of each other and `exponent_walled` for its whole
+    length as soon as one wall stands between, or, where `wall_db` is given, costs that much for every wall instead.
+    The defaults are a 2.4 GHz radio of 1 mW: 31.6 m in the clear, 5.6 m behind walls.
+    """
+
+    model: Literal["disc", "path-loss"] = "disc"
+    range_m: float = Field(default=5.0, gt=0.0, description="disc: distance at which two drones still hear each other")
+    tx_dbm: float = Field(default=0.0, ge=-60.0, le=40.0, description="path-loss: transmitted power")
+    loss_1m_db: float = Field(default=40.0, ge=0.0, le=100.0, description="path-loss: over the first metre, 2.4 GHz")
+    threshold_dbm: float = Field(default=-70.0, ge=-150.0, le=0.0, description="path-loss: least power that is heard")
+    exponent_clear: float = Field(default=2.0, ge=1.0, le=8.0, description="path-loss: exponent in the clear")
+    exponent_walled: float = Field(default=4.0, ge=1.0, le=8.0, description="path-loss: exponent through walls")
+    wall_db: float | None = Field(
+        default=None, gt=0.0, le=100.0, description="path-loss: loss per wall between, instead of the larger exponent"
+    )
     ground_range_m: float | None = Field(default=None, gt=0.0, description="the ground station's range; none: any")
     rate_bps: float = Field(default=250_000.0, gt=0.0, description="bits per second of each sender")
     latency_s: float = Field(default=0.02, ge=0.0, le=10.0, description="delay on top of the time on air")
     loss: float = Field(default=0.0, ge=0.0, le=1.0, description="chance that a receiver in range misses a datagram")
     queue_bytes: int = Field(default=16_384, ge=1, description="what waits to be sent; more is dropped")
-    wall_m: float = Field(default=0.0, ge=0.0, description="range that each wall (of two faces) between costs")
+
+    @property
+    def propagation(self) -> Propagation:
+        """How far drones hear each other, in the numbers that the kernels of `sim.propagation` take."""
+        if self.model == "disc":
+            return disc(self.range_m)
+        budget_db = self.tx_dbm - self.loss_1m_db - self.threshold_dbm
+        return path_loss(budget_db, self.exponent_clear, self.exponent_walled, self.wall_db)
 
 
 @dataclass
@@ -42,12 +66,17 @@ class StationCounters:
 
 @dataclass
 class LinkCounters:
-    """What became of the datagrams from one station to another."""
+    """What became of the datagrams from one station to another, and in how many ticks the two were in reach.
+
+    A tick is a time at which deliveries were asked for.
+    """
 
     delivered: int = 0
     delivered_bytes: int = 0
     lost: int = 0
+    lost_bytes: int = 0
     out_of_range: int = 0
+    ticks: int = 0
 
 
 @dataclass(frozen=True)
@@ -75,10 +104,12 @@ class RadioMedium:
         self.sent = [StationCounters() for _ in range(self.stations)]
         self.links = [[LinkCounters() for _ in range(self.stations)] for _ in range(self.stations)]
         self._rng = rng
-        self._walls = np.empty((0, 4)) if walls is None else walls
+        self._walls = np.empty((0, 4)) if walls is None else np.ascontiguousarray(walls, np.float64)
+        self._propagation = settings.propagation
         self._busy_until = [0.0] * self.stations
         self._in_flight: list[tuple[float, int, int, bytes]] = []
         self._sequence = 0
+        self._delivered_at = -np.inf
 
     def send(self, sender: int, datagram: bytes, now: float) -> bool:
         """Put a datagram into the sender's queue at the time `now`, in seconds; False when the queue is full."""
@@ -99,11 +130,13 @@ class RadioMedium:
     def deliver(self, now: float, positions: NDArray[np.float64]) -> list[Delivery]:
         """Return what has arrived by `now`, by arrival, sender and order of sending; drones at `positions` `[n, 2]`."""
         deliveries: list[Delivery] = []
-        reach: NDArray[np.bool_] | None = None
+        reach = self.in_reach(positions)
+        if now > self._delivered_at:
+            self._delivered_at = now
+            for sender, receiver in np.argwhere(reach):
+                self.links[sender][receiver].ticks += 1
         while self._in_flight and self._in_flight[0][0] <= now + 1e-9:
             _, sender, _, datagram = heapq.heappop(self._in_flight)
-            if reach is None:
-                reach = self.in_reach(positions)
             for receiver in range(self.stations):
                 if receiver == sender:
                     continue
@@ -112,6 +145,7 @@ class RadioMedium:
                     link.out_of_range += 1
                 elif self.settings.loss > 0.0 and self._rng.random() < self.settings.loss:
                     link.lost += 1
+                    link.lost_bytes += len(datagram)
                 else:
                     link.delivered += 1
                     link.delivered_bytes += len(datagram)
@@ -119,29 +153,16 @@ class RadioMedium:
         return deliveries
 
     def in_reach(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which stations hear each other, `[stations, stations]`; the ground stands at the map's origin."""
-        places = np.zeros((self.stations, 2))
-        places[1:] = positions[:, :2]
-        distance = np.linalg.norm(places[:, None] - places[None], axis=2)
-        limit = np.full_like(distance, self.settings.range_m)
-        if self.settings.wall_m > 0.0 and len(self._walls):
-            for a in range(1, self.stations):
-                for b in range(a + 1, self.stations):
-                    limit[a, b] -= self.settings.wall_m * _crossings(places[a], places[b], self._walls) / 2
-                    limit[b, a] = limit[a, b]
+        """Tell which stations hear each other, `[stations, stations]`; the ground stands at the map's origin.
+
+        Nobody hears itself. Walls do not count between a drone and the ground, whose antenna is its operator's choice.
+        """
+        places = np.ascontiguousarray(positions[:, :2], np.float64)
+        between_drones = np.empty((len(places), len(places)), np.uint8)
+        fill_reach(between_drones, places, self._walls, self._propagation)
+        reach = np.zeros((self.stations, self.stations), np.bool_)
+        reach[1:, 1:] = between_drones
         ground_range = self.settings.ground_range_m
-        limit[GROUND, :] = limit[:, GROUND] = np.inf if ground_range is None else ground_range
-        reach: NDArray[np.bool_] = distance <= limit
+        near = True if ground_range is None else np.linalg.norm(places, axis=1) <= ground_range
+        reach[GROUND, 1:] = reach[1:, GROUND] = near
         return reach
-
-
-def _crossings(a: NDArray[np.float64], b: NDArray[np.float64], walls: NDArray[np.float64]) -> int:
-    """Count the segments `walls` `[n, 4]` that the line from `a` to `b` crosses."""
-    along = b - a
-    start, wall = walls[:, :2], walls[:, 2:] - walls[:, :2]
-    denominator = along[0] * wall[:, 1] - along[1] * wall[:, 0]
-    offset = start - a
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = (offset[:, 0] * wall[:, 1] - offset[:, 1] * wall[:, 0]) / denominator
-        u = (offset[:, 0] * along[1] - offset[:, 1] * along[0]) / denominator
-    return int(np.count_nonzero((denominator != 0.0) & (t >= 0.0) & (t <= 1.0) & (u >= 0.0) & (u <= 1.0)))

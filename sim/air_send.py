@@ -1,0 +1,345 @@
+"""The sending half of the batched air: what each drone puts on air, in which order, within its budget of bytes.
+
+As `MeshNode.offer_scan` and `poll`, `TileExchange.plan` and `RadioMedium.send`. All arrays but the air's own are those
+of one world.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from imagine.core.raster import TILE
+from imagine.mesh_comm.messages import MAX_DATAGRAM
+from imagine.mesh_comm.seal import OVERHEAD
+from imagine.sim.air import (
+    BYTES_SENT,
+    DIGEST,
+    MESSAGES_SENT,
+    MOST_WANTED,
+    NEVER,
+    SCAN,
+    STATUS,
+    TILES,
+    UNIT_TILES,
+)
+from imagine.sim.air_costs import (
+    digest_message_bytes,
+    packed_tile_bytes,
+    packed_versions_bytes,
+    scan_bytes,
+    status_bytes,
+    tile_in_message_bytes,
+    tiles_message_bytes,
+)
+from imagine.sim.air_receive import is_live
+from imagine.sim.air_tiles import align_marks, copy_tile
+
+# these are those of mesh_comm.node, tile_exchange and digest
+_PLAN_PERIOD_S = 0.2
+_DIGEST_DATAGRAMS = 4
+_DIGEST_GRACE_S = 0.25
+_EPSILON_S = 1e-6
+_MAX_PAYLOAD = MAX_DATAGRAM - OVERHEAD
+_RESERVED_TILE, _RESERVED_TILES = 16, 10
+_RESERVED_HOLDING, _RESERVED_DIGEST = 24, 24
+_MOST_TILES = 256
+
+_ROWS, _PLACES, _SOURCES, _STALE, _MISSING = 1 << 12, 1 << 24, 1 << 6, 1 << 24, 1 << 6  # digits of a queue entry
+
+
+@numba.njit(cache=True, nogil=True)
+def send(air, world, tick, poses, velocity, ranges, marks, mark_corner, clocks, layers, versions):  # type: ignore[no-untyped-def]
+    """Let every drone of `world` say at `tick` what it has to say; call it when own scans have been integrated.
+
+    `poses` `[drones, 3]` and `velocity` `[drones, 2 or more]` in the map frame; `ranges` float32 `[drones, beams]` as
+    they were mapped; `marks` int8 `[drones, side, side]` the evidence of each drone's scan around its cell, the first
+    of it at `mark_corner` (`[drones, 2]`: row and column of the grid, negative where it starts outside), with `side`
+    twice the range cap in cells, rounded up, plus 3; `clocks` `[drones]` the own layers' clocks. `layers` and
+    `versions` as in `deliver`.
+    """
+    rules = air.rules
+    now = tick / rules.ticks_per_s
+    nodes, messages, counters, peers = air.nodes[world], air.messages[world], air.counters[world], air.peers[world]
+    for drone in range(layers.shape[0]):
+        node = nodes[drone]
+        node.tokens = min(rules.burst, node.tokens + rules.budget_rate / rules.ticks_per_s)
+        live = 0  # a bit for each peer in touch
+        for peer in range(layers.shape[0]):
+            if is_live(peers[drone, peer], tick, rules):
+                live |= 1 << peer
+        shares = live != 0 and rules.shares
+        can_offer = shares and now >= node.next_scan - _EPSILON_S and node.scans < air.windows.shape[2]
+        if can_offer and np.int64(clocks[drone]) != node.scan_clock:
+            slot = (node.first_scan + node.scans) % air.windows.shape[2]
+            _keep_scan(
+                node, air.windows[world, drone, slot], air.marks[world, drone, slot], poses[drone], marks[drone],
+                mark_corner[drone], clocks[drone],
+            )  # fmt: skip
+            node.pending_bytes = scan_bytes(ranges[drone], rules.range_min, rules.range_cap, node.pending_clock)
+        if shares and now >= node.next_digest - _EPSILON_S:
+            node.next_digest = now + rules.digest_period
+            node.digest_units = layers.shape[1] * _units(versions.shape[2] * versions.shape[3])
+            node.digest_parts = _DIGEST_DATAGRAMS
+        if now >= node.next_plan - _EPSILON_S:
+            node.next_plan = now + _PLAN_PERIOD_S
+            node.wanted = 0
+            if shares:
+                _plan(air, world, tick, drone, live, versions)
+        if now >= node.next_status - _EPSILON_S:
+            said = _send_status(
+                rules, now, node, messages[drone], counters[drone], peers[drone], poses[drone], velocity[drone], live
+            )  # fmt: skip
+            if not said:
+                continue
+        if node.digest_units > 0 and node.digest_parts > 0:
+            said = _send_digests(
+                rules, now, drone, node, messages[drone], counters[drone], air.digests[world, drone], versions[drone]
+            )  # fmt: skip
+            if not said:
+                continue
+        # scans must not starve tiles: whichever of the two went short of bytes goes first the next time
+        if node.tiles_first:
+            if _send_tiles(air, world, tick, drone, layers, versions):
+                node.tiles_first = False
+                _send_scan(rules, now, node, messages[drone], counters[drone], air.windows[world, drone])
+        elif _send_scan(rules, now, node, messages[drone], counters[drone], air.windows[world, drone]):
+            node.tiles_first = node.wanted > 0 and not _send_tiles(air, world, tick, drone, layers, versions)
+
+
+@numba.njit(cache=True, nogil=True)
+def _can_send(node, messages, size):  # type: ignore[no-untyped-def]
+    """Tell whether the byte budget and the ring of messages have room."""
+    return size <= node.tokens and node.messages < messages.shape[0]
+
+
+@numba.njit(cache=True, nogil=True)
+def _transmit(rules, now, node, messages, counters, kind, size):  # type: ignore[no-untyped-def]
+    """Spend the bytes and put a message behind the sender's others on air; return its place in the ring, or -1.
+
+    The radio drops what its queue does not hold, as `RadioMedium.send`; the node does not know, and has paid.
+    """
+    node.tokens -= size
+    counters[BYTES_SENT + kind] += size
+    counters[MESSAGES_SENT + kind] += 1
+    start = max(now, node.busy_until)
+    if (start - now) * rules.air_rate + size > rules.queue_bytes:
+        node.dropped += 1
+        return -1
+    place = (node.first_message + node.messages) % messages.shape[0]
+    message = messages[place]
+    node.busy_until = start + size / rules.air_rate
+    message.arrival = node.busy_until + rules.latency
+    message.kind, message.size, message.sequence = kind, size, node.sequence
+    node.sequence += 1
+    node.messages += 1
+    return place
+
+
+@numba.njit(cache=True, nogil=True)
+def _send_status(rules, now, node, messages, counters, peers, pose, velocity, live):  # type: ignore[no-untyped-def]
+    """Send where the drone is and whom it hears; False when bytes run short."""
+    heard = 0
+    for peer in range(peers.shape[0]):
+        heard += peers[peer].heard_tick >= 0
+    size = status_bytes(counters[:MESSAGES_SENT], heard)
+    if not _can_send(node, messages, size):
+        return False
+    place = _transmit(rules, now, node, messages, counters, STATUS, size)
+    if place >= 0:
+        message = messages[place]
+        message.x, message.y, message.yaw = pose[0], pose[1], pose[2]
+        message.vx, message.vy, message.hears = velocity[0], velocity[1], live
+    node.next_status = now + rules.status_period
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _units(tiles):  # type: ignore[no-untyped-def]
+    """Return into how many units a digest cuts the tiles of one source."""
+    return (tiles + UNIT_TILES - 1) // UNIT_TILES
+
+
+@numba.njit(cache=True, nogil=True)
+def _send_digests(rules, now, drone, node, messages, counters, digests, versions):  # type: ignore[no-untyped-def]
+    """Tell which tiles of others are held, in as many datagrams as that takes; a long digest goes on the next time.
+
+    `versions` are those that the drone holds, `[source, tile rows, tile columns]`. False when bytes run short.
+    """
+    sources, tile_columns, slots = versions.shape[0], versions.shape[2], digests.shape[0]
+    tiles = versions.shape[1] * tile_columns
+    units = _units(tiles)
+    while node.digest_units > 0 and node.digest_parts > 0:
+        first = node.digest_unit
+        last, reserved, holdings, packed = first, _RESERVED_DIGEST, 0, 0
+        while last < sources * units and last - first < node.digest_units:
+            source, begin, held = last // units, last % units * UNIT_TILES, 0
+            if source != drone:
+                for tile in range(begin, min(begin + UNIT_TILES, tiles)):
+                    held += versions[source, tile // tile_columns, tile % tile_columns] > 0
+            if held > 0:
+                size = packed_versions_bytes(held)
+                if holdings > 0 and reserved + size + _RESERVED_HOLDING > _MAX_PAYLOAD:
+                    break
+                reserved += size + _RESERVED_HOLDING
+                holdings += 1
+                packed += size
+            last += 1
+        size = digest_message_bytes(holdings, packed)
+        if node.digests == slots or not _can_send(node, messages, size):
+            return False
+        place = _transmit(rules, now, node, messages, counters, DIGEST, size)
+        if place >= 0:
+            messages[place].first_unit, messages[place].last_unit = first, last
+            copy = digests[(node.first_digest + node.digests) % slots]
+            for source in range(first // units, (last - 1) // units + 1):
+                for tile in range(tiles):
+                    copy[source, tile] = versions[source, tile // tile_columns, tile % tile_columns]
+            node.digests += 1
+        node.digest_units -= last - first
+        node.digest_parts -= 1
+        node.digest_unit = last % (sources * units)
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _keep_scan(node, window, aligned, pose, marks, mark_corner, clock):  # type: ignore[no-untyped-def]
+    """Keep the marks of a scan that changed the map, for sending; it replaces one that still waits."""
+    window.row, window.column = mark_corner[0], mark_corner[1] // TILE * TILE
+    window.middle = mark_corner[1] + marks.shape[1] // 2
+    window.x, window.y, window.yaw = pose[0], pose[1], pose[2]
+    window.clock = node.pending_clock = np.int64(clock)
+    align_marks(marks, aligned, mark_corner[1] - window.column)
+
+
+@numba.njit(cache=True, nogil=True)
+def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[no-untyped-def]
+    """Send the scan that waits, if any; False when bytes run short."""
+    if node.pending_clock == 0:
+        return True
+    if not _can_send(node, messages, node.pending_bytes):
+        return False
+    place = _transmit(rules, now, node, messages, counters, SCAN, node.pending_bytes)
+    if place >= 0:
+        window = windows[(node.first_scan + node.scans) % windows.shape[0]]
+        messages[place].x, messages[place].y, messages[place].yaw = window.x, window.y, window.yaw
+        node.scans += 1
+    node.scan_clock, node.pending_clock = node.pending_clock, 0
+    node.next_scan = now + rules.scan_period
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _plan(air, world, tick, drone, live, versions):  # type: ignore[no-untyped-def]
+    """Queue the tiles that some peer in touch, by its last digest, lacks: most lacking first, then most outdated.
+
+    A queue entry is its rank and place in one number, least first.
+    """
+    rules, node, peers = air.rules, air.nodes[world, drone], air.peers[world, drone]
+    rate, drones, tile_columns = rules.ticks_per_s, versions.shape[1], versions.shape[3]
+    now = tick / rate
+    wanted, holdings = air.wanted[world, drone], air.holdings[world, drone]
+    readers = 0  # a bit for each peer in touch that has told what it holds
+    for peer in range(drones):
+        if peers[peer].digest_tick >= 0:
+            readers |= live & 1 << peer
+    for source in range(drones):
+        if readers == 0 or (source != drone and not rules.relays):
+            continue
+        held, notes = versions[drone, source], air.notes[world, drone, source]
+        for tile in range(notes.shape[0]):
+            row, column = tile // tile_columns, tile % tile_columns
+            version = np.int64(held[row, column])
+            if version == 0:
+                continue
+            note = notes[tile]
+            was_sent = note.sent_tick > NEVER
+            sent_at = note.sent_tick / rate
+            if was_sent and now - sent_at < rules.tile_period:
+                continue
+            missing, stale = 0, 0
+            for peer in range(drones):
+                has = np.int64(holdings[peer, source, tile])
+                if has >= version or (readers >> peer) & 1 == 0 or peer == source:
+                    continue
+                if was_sent and np.int64(note.sent_version) >= version:
+                    if peers[peer].digest_tick / rate < sent_at + _DIGEST_GRACE_S:
+                        continue  # sent since this peer last told what it holds
+                if source != drone and (readers >> source) & 1 == 1:
+                    if (peers[peer].hears >> source) & 1 == 1 and (peers[source].hears >> peer) & 1 == 1:
+                        continue  # source and peer hear each other: the source sends its newest tiles itself
+                missing += has == 0
+                stale += version - has
+            if stale > 0:
+                rank = (_MISSING - 1 - missing) * _STALE + max(0, _STALE - 1 - stale)
+                place = column * _ROWS + row  # ties in the order of tile keys
+                wanted[node.wanted] = ((rank * 2 + (source != drone)) * _SOURCES + source) * _PLACES + place
+                node.wanted += 1
+    _sort(wanted, node.wanted)
+    node.wanted = min(node.wanted, MOST_WANTED)
+
+
+@numba.njit(cache=True, nogil=True)
+def _sort(values, count):  # type: ignore[no-untyped-def]
+    """Sort the first `count` values, in place: a Shell sort with Knuth's gaps (1973), for it needs no memory."""
+    gap = 1
+    while gap < count // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(gap, count):
+            value, j = values[i], i
+            while j >= gap and values[j - gap] > value:
+                values[j] = values[j - gap]
+                j -= gap
+            values[j] = value
+        gap //= 3
+
+
+@numba.njit(cache=True, nogil=True)
+def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-untyped-def]
+    """Send the queue, a datagram of one source's tiles at a time; False when bytes or rings run short."""
+    node, wanted = air.nodes[world, drone], air.wanted[world, drone]
+    messages, counters = air.messages[world, drone], air.counters[world, drone]
+    tile_columns, slots = versions.shape[3], air.tile_cells.shape[2]
+    now = tick / air.rules.ticks_per_s
+    while node.wanted > 0:
+        source = wanted[0] // _PLACES % _SOURCES
+        cells = layers[drone, source] if source == drone else air.confirmed[world, drone, source]
+        held, notes = versions[drone, source], air.notes[world, drone, source]
+        reserved, size, count = _RESERVED_TILES, 0, 0
+        for entry in range(node.wanted):
+            if wanted[entry] // _PLACES % _SOURCES != source:
+                continue
+            row, column = wanted[entry] % _ROWS, wanted[entry] % _PLACES // _ROWS
+            note = notes[row * tile_columns + column]
+            if note.cost_version != held[row, column]:
+                note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), held[row, column]
+            reserved += note.cost + _RESERVED_TILE
+            if reserved > _MAX_PAYLOAD or count == _MOST_TILES or node.tiles + count == slots:
+                break
+            size += tile_in_message_bytes(np.int64(note.cost), np.int64(note.cost_version))
+            count += 1
+        size += tiles_message_bytes(count)
+        if count == 0 or not _can_send(node, messages, size):
+            return False
+        place = _transmit(air.rules, now, node, messages, counters, TILES, size)
+        left = taken = 0
+        for entry in range(node.wanted):
+            if taken == count or wanted[entry] // _PLACES % _SOURCES != source:
+                wanted[left] = wanted[entry]
+                left += 1
+                continue
+            row, column = wanted[entry] % _ROWS, wanted[entry] % _PLACES // _ROWS
+            tile = row * tile_columns + column
+            if place >= 0:
+                slot = (node.first_tile + node.tiles + taken) % slots
+                air.tile_keys[world, drone, slot, 0] = tile
+                air.tile_keys[world, drone, slot, 1] = held[row, column]
+                copy_tile(cells, row * TILE, column * TILE, air.tile_cells[world, drone, slot], 0, 0)
+            notes[tile].sent_version, notes[tile].sent_tick = held[row, column], tick
+            taken += 1
+        node.wanted = left
+        if place >= 0:
+            messages[place].source, messages[place].count = source, count
+            node.tiles += count
+    return True
