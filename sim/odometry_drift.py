@@ -29,17 +29,24 @@ class DriftSettings(Settings):
     """The model's constants; the defaults are fitted to flights with instantaneous scans, see docs/sensing.md."""
 
     enabled: bool = Field(default=False, description="give drones drifting poses; otherwise they know where they are")
-    sigma_m: float = Field(default=0.028, ge=0.0, le=10.0, description="drift of x and of y, once levelled off")
-    length_m: float = Field(default=6.0, gt=0.0, description="distance over which drift of x and y is forgotten")
-    sigma_rad: float = Field(default=0.006, ge=0.0, le=1.0, description="the same of yaw")
-    length_rad_m: float = Field(default=3.0, gt=0.0, description="distance over which drift of yaw is forgotten")
-    per_rad_m: float = Field(default=0.0, ge=0.0, description="a radian turned counts as so many metres flown")
-    jitter_m: float = Field(default=0.006, ge=0.0, le=1.0, description="error of x and of y that is new every scan")
-    jitter_rad: float = Field(default=0.0012, ge=0.0, le=1.0, description="the same of yaw")
-    lag_s: float = Field(default=0.007, ge=-1.0, le=1.0, description="how old the estimated position is")
+    sigma_m: float = Field(default=0.051, ge=0.0, le=10.0, description="drift of x and of y, once levelled off")
+    length_m: float = Field(default=100.0, gt=0.0, description="distance over which drift of x and y is forgotten")
+    sigma_rad: float = Field(default=0.0062, ge=0.0, le=1.0, description="the same of yaw")
+    length_rad_m: float = Field(default=3.6, gt=0.0, description="distance over which drift of yaw is forgotten")
+    per_rad_m: float = Field(default=0.15, ge=0.0, description="a radian turned counts as so many metres flown")
+    jitter_m: float = Field(default=0.0073, ge=0.0, le=1.0, description="error of x and of y that is new every scan")
+    jitter_rad: float = Field(default=0.0011, ge=0.0, le=1.0, description="the same of yaw")
+    lag_s: float = Field(default=0.0065, ge=-1.0, le=1.0, description="how old the estimated position is")
     spread: float = Field(
-        default=0.7, ge=0.0, le=2.0, description="deviation of the logarithm of a drone's drift from flight to flight"
+        default=0.76, ge=0.0, le=2.0, description="deviation of the logarithm of a drone's drift from flight to flight"
     )
+
+
+SKEWED = DriftSettings(
+    enabled=True, sigma_m=0.049, length_m=100.0, sigma_rad=0.0065, length_rad_m=20.0, per_rad_m=0.0, jitter_m=0.017,
+    jitter_rad=0.0055, lag_s=0.0077, spread=0.56,
+)  # fmt: skip
+"""The same of flights with skewed scans that the odometry deskews, as a real spinning LiDAR's are."""
 
 
 class OdometryDrift:
@@ -130,12 +137,13 @@ Track = tuple[NDArray[np.float64], NDArray[np.float64]]
 """A drone's true and its estimated poses, `[ticks, 3]` each."""
 _GAPS_M = np.geomspace(0.1, 50.0, 13)
 _LONGEST_M = 100.0
+_WINDOWS = (2, 5, 10, 20)  # ticks; of several lengths, to tell what grows from the jitter that does not
 
 
 def fit(tracks: Sequence[Track], dt: float) -> DriftSettings:
     """Return the model whose errors grow with distance as those of the tracks do; `dt` is seconds between poses.
 
-    Lag by regression on velocity; metres per radian by regression of what errors change by within a second; the rest
+    Lag by regression on velocity; metres per radian by regression of what errors change by within two seconds; the rest
     by least squares on the mean square change of the error over gaps of 0.1 to 50 m, 2 jitter² + 2 sigma² (1 −
     exp(−gap / length)); the spread from how much the tracks' rms errors differ beyond what the model's own do.
     """
@@ -143,7 +151,7 @@ def fit(tracks: Sequence[Track], dt: float) -> DriftSettings:
     errors = [pose_errors(*track) for track in tracks]
     for error, (true, _) in zip(errors, tracks, strict=True):
         error[1:, :2] += lag_s / dt * np.diff(true[:, :2], axis=0)
-    per_rad = _metres_per_radian(tracks, errors, round(1.0 / dt))
+    per_rad = _metres_per_radian(tracks, errors)
     ways = [_way(true, per_rad) for true, _ in tracks]
     sigma_m, length_m, jitter_m = _levelling_off(ways, [error[:, :2] for error in errors])
     sigma_rad, length_rad_m, jitter_rad = _levelling_off(ways, [error[:, 2:] for error in errors])
@@ -189,16 +197,18 @@ def _lag(tracks: Sequence[Track], dt: float) -> float:
     return round(across / along, 4)
 
 
-def _metres_per_radian(tracks: Sequence[Track], errors: list[NDArray[np.float64]], ticks: int) -> float:
-    """Regress the square of what positions and headings change by on metres flown and radians turned meanwhile."""
+def _metres_per_radian(tracks: Sequence[Track], errors: list[NDArray[np.float64]]) -> float:
+    """Regress the square of what positions change by on the metres flown and the radians turned meanwhile."""
     from scipy.optimize import nnls  # here, since only fitting needs it
 
     rows, squares = [], []
     for (true, _), error in zip(tracks, errors, strict=True):
-        flown, turned = _way(true, 0.0), _way(true, 1.0) - _way(true, 0.0)
-        rows.append(np.column_stack((np.ones(len(true) - ticks), flown[ticks:] - flown[:-ticks],
-                                     turned[ticks:] - turned[:-ticks])))  # fmt: skip
-        squares.append((error[ticks:, :2] - error[:-ticks, :2]) ** 2 @ np.ones(2))
+        flown = _way(true, 0.0)
+        turned = _way(true, 1.0) - flown
+        for ticks in _WINDOWS:
+            columns = (np.ones(len(true) - ticks), flown[ticks:] - flown[:-ticks], turned[ticks:] - turned[:-ticks])
+            rows.append(np.column_stack(columns))
+            squares.append(np.square(error[ticks:, :2] - error[:-ticks, :2]).sum(axis=1))
     (_, per_m, per_rad), _ = nnls(np.concatenate(rows), np.concatenate(squares))
     return round(float(per_rad / per_m), 2) if per_m > 0.0 else 0.0
 
@@ -217,24 +227,25 @@ def _levelling_off(ways: list[NDArray[np.float64]], errors: list[NDArray[np.floa
     """
     from scipy.optimize import least_squares
 
-    sums = np.zeros((2, len(_GAPS_M), 2))
+    sums = np.zeros((2, len(_GAPS_M), 3))
     for way, error in zip(ways, errors, strict=True):
         for k, gap in enumerate(_GAPS_M):
+            now = np.arange(len(way))
             later = np.searchsorted(way, way + gap)
-            there = later < len(way)
-            change, since_launch = error[later[there]] - error[there], error[(way > 0.8 * gap) & (way < 1.25 * gap)]
-            for kind, part in enumerate((change, since_launch)):
-                sums[kind, k] += np.square(part).sum(), part.size
-    counts = np.maximum(sums[..., 1], 1.0)
-    mean_square = (sums[..., 0] / counts).ravel()
-    used = mean_square > 0.0
-    gaps = _GAPS_M
+            now, later = now[later < len(way)], later[later < len(way)]
+            near = np.flatnonzero((way > 0.8 * gap) & (way < 1.25 * gap))
+            for kind, begin, end in ((0, now, later), (1, np.zeros_like(near), near)):
+                change = error[end] - (error[begin] if kind == 0 else 0.0)
+                sums[kind, k] += np.square(change).sum(), (way[end] - way[begin]).sum() * error.shape[1], change.size
+    counts = np.maximum(sums[..., 2], 1.0)
+    mean_square, gaps = sums[..., 0] / counts, sums[..., 1] / counts  # ticks are coarser than the shortest gaps
+    used = (mean_square > 0.0) & (counts >= len(ways))  # not what only a few tracks tell of
 
     def misfit(logs: NDArray[np.float64]) -> NDArray[np.float64]:
         sigma2, length, jitter2 = np.exp(logs * (2.0, 1.0, 2.0))
-        change = 2.0 * sigma2 * (1.0 - np.exp(-gaps / length)) + 2.0 * jitter2
-        since_launch = sigma2 * (1.0 - np.exp(-2.0 * gaps / length)) + jitter2
-        off: NDArray[np.float64] = np.log(np.concatenate((change, since_launch))[used] / mean_square[used])
+        change = 2.0 * sigma2 * (1.0 - np.exp(-gaps[0] / length)) + 2.0 * jitter2
+        since_launch = sigma2 * (1.0 - np.exp(-2.0 * gaps[1] / length)) + jitter2
+        off: NDArray[np.float64] = np.log(np.stack((change, since_launch))[used] / mean_square[used])
         return off
 
     size = math.sqrt(mean_square[used].max())
