@@ -18,8 +18,8 @@ from pydantic import Field
 from scipy.spatial import KDTree
 
 from imagine.core.config import Settings
-from imagine.core.frames import IDENTITY, Pose, compose, relative, transform_points, wrap_angle
-from imagine.core.lidar import LidarSpec, Scan, points
+from imagine.core.frames import IDENTITY, Pose, compose, relative, rotate, transform_points, wrap_angle
+from imagine.core.lidar import LidarSpec, Scan, points, returns
 
 
 class OdometrySettings(Settings):
@@ -40,6 +40,9 @@ class OdometrySettings(Settings):
     max_correction_m: float = Field(default=0.5, gt=0.0, description="a match farther from the guess is wrong")
     max_speed_mps: float = Field(default=5.0, gt=0.0, description="a faster motion is a wrong match")
     max_yaw_error_rad: float = Field(default=0.35, gt=0.0, description="largest disagreement with the yaw prior")
+    deskew: bool = Field(
+        default=False, description="beams come one after another: put each where the end of the turn would have seen it"
+    )
 
 
 class OdometryResult(NamedTuple):
@@ -82,9 +85,10 @@ class LidarOdometry:
         `yaw_prior` is the autopilot's yaw at the scan's stamp, radians counter-clockwise, from any origin: only its
         increments are used. Nothing raises: a scan that cannot be matched gives `ok` false and a reason.
         """
-        cloud = points(scan, self.spec)
+        motion = self._predicted_motion(yaw_prior)
+        cloud = deskewed(scan, self.spec, motion) if self.settings.deskew else points(scan, self.spec)
         source = _thin(cloud, self.settings.source_voxel_m)
-        guess = compose(self.pose, self._predicted_motion(yaw_prior))
+        guess = compose(self.pose, motion)
         elapsed = 0.0 if self._stamp is None else scan.stamp - self._stamp
 
         if len(source) < self.settings.min_points:
@@ -150,6 +154,20 @@ class LidarOdometry:
         if overlap < s.min_overlap:
             return f"only {overlap:.0%} of the scan meets the last one, needs {s.min_overlap:.0%}"
         return None
+
+
+def deskewed(scan: Scan, spec: LidarSpec, motion: Pose) -> NDArray[np.float64]:
+    """Return the hit points `[hits, 2]` in the body frame at the scan's stamp, the end of its turn, metres.
+
+    `motion` is the drone's from one stamp to the next, in the frame of the former; it is taken as uniform over the
+    turn, as KISS-ICP does. Beam i of n was taken (1 − i / n) of the turn before the stamp.
+    """
+    cloud, hit = points(scan, spec), np.flatnonzero(returns(scan, spec))
+    left = (1.0 - hit / spec.beams) * spec.fov / (2.0 * math.pi)
+    back_x, back_y = rotate(-motion.yaw, -motion.x, -motion.y)
+    c, s = np.cos(-motion.yaw * left), np.sin(-motion.yaw * left)
+    x, y = cloud.T
+    return np.column_stack((c * x - s * y + left * back_x, s * x + c * y + left * back_y))
 
 
 def _thin(cloud: NDArray[np.float64], voxel_m: float) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numba
@@ -166,29 +166,36 @@ class LevelArrays(NamedTuple):
 
 def make_room(arrays: LevelArrays | None, rows: int, index: LevelIndex) -> LevelArrays:
     """Return arrays of at least `rows` rows into which `index` fits; those given where they do already."""
-    wanted = (index.edges, index.circles, np.zeros(3), np.zeros(3, np.int64), index.starts, index.items, index.nearest)
-    if arrays is None:
-        grown = [np.zeros((rows, *part.shape), part.dtype) for part in wanted]
-        return LevelArrays(*grown, longest=index.longest)  # type: ignore[arg-type]
-    old = arrays[:-1]
-    if len(old[0]) >= rows and all(a.shape[1] >= len(part) for a, part in zip(old, wanted, strict=True)):
-        return arrays._replace(longest=max(arrays.longest, index.longest))
-    grown = []
-    for array, part in zip(old, wanted, strict=True):
-        length = array.shape[1] if array.shape[1] >= len(part) else len(part) + len(part) // 4
-        larger = np.zeros((max(rows, len(array)), length, *array.shape[2:]), array.dtype)
-        larger[: len(array), : array.shape[1]] = array
-        grown.append(larger)
-    return LevelArrays(*grown, longest=max(arrays.longest, index.longest))  # type: ignore[arg-type]
+    longest = index.longest if arrays is None else max(index.longest, arrays.longest)
+    grown: dict[str, NDArray[Any]] = {}
+    for name, part in _row_of(index).items():
+        array = np.zeros((0, *part.shape), part.dtype) if arrays is None else getattr(arrays, name)
+        length = array.shape[1]
+        if len(array) < rows or length < len(part):
+            longer = length if length >= len(part) else len(part) + len(part) // 4
+            larger = np.zeros((max(rows, len(array)), longer, *array.shape[2:]), array.dtype)
+            larger[: len(array), :length] = array
+            array = larger
+        grown[name] = array
+    return LevelArrays(longest=longest, **grown)
 
 
 def write_row(arrays: LevelArrays, row: int, index: LevelIndex) -> None:
     """Put an index into a row; there must be room."""
-    arrays.place[row] = (*index.corner, 1.0 / index.side_m)
-    arrays.shape[row] = (*index.shape, len(index.edges))
-    for name in ("edges", "circles", "starts", "items", "nearest"):
-        part = getattr(index, name)
+    for name, part in _row_of(index).items():
         getattr(arrays, name)[row, : len(part)] = part
+
+
+def _row_of(index: LevelIndex) -> dict[str, NDArray[Any]]:
+    return {
+        "edges": index.edges,
+        "circles": index.circles,
+        "place": np.array((*index.corner, 1.0 / index.side_m)),
+        "shape": np.array((*index.shape, len(index.edges))),
+        "starts": index.starts,
+        "items": index.items,
+        "nearest": index.nearest,
+    }
 
 
 @numba.njit(cache=True, nogil=True)

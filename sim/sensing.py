@@ -37,8 +37,8 @@ class Sensing:
     ) -> None:
         """Prepare the sensors; give each world its level before the first scan.
 
-        `world_keys` are the worlds' numbers, by default 0, 1, 2 ...: with `seed` they decide a world's noise, whatever other
-        worlds there are.
+        `world_keys` are the worlds' numbers, by default 0, 1, 2 ...: with `seed` they decide a world's noise, whatever
+        other worlds there are.
         """
         self.worlds, self.drones, self.lidar, self.seed = worlds, drones, lidar, seed
         self.model = model or LidarModel()
