@@ -1,4 +1,4 @@
-"""Floor plans as JSON, in the manner of HouseExpo: `verts`, the walls' inner face as a polygon in metres, and `bbox`."""
+"""Floor plans as JSON, in the manner of HouseExpo: `verts`, a polygon in metres that is free inside, and `bbox`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def load_floorplan(path: Path) -> Level:
     verts = data["verts"]
     for number, vertex in enumerate(verts if isinstance(verts, list) else ()):
         if not (isinstance(vertex, list) and len(vertex) == 2 and all(map(_is_number, vertex))):
-            raise InputError(f"{path}: verts.{number}: expected [x, y] in metres, got {str(vertex):.60}")
+            raise InputError(f"{path}: verts.{number}: expected [x, y] in metres, got {vertex!s:.60}")
     if not isinstance(verts, list) or not verts:
         raise InputError(f"{path}: verts: expected a list of corners [x, y] in metres")
     corners = np.array(verts, float)

@@ -131,7 +131,8 @@ class Level:
         under = np.zeros((2 * rows + 1, 2 * columns + 1), np.uint8)
         for crate in self.crates:
             fill_loop(under, crate.corners(), column0, row0, 1)
-        return self.survey.seen & (under[1::2, 1::2] == 0)
+        open_cells: NDArray[np.bool_] = self.survey.seen & (under[1::2, 1::2] == 0)
+        return open_cells
 
     @cached_property
     def launch_spots(self) -> NDArray[np.float64]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from imagine.core.config import KeyPath
 from imagine.core.errors import InputError
 from imagine.core.raster import CELL
 from imagine.sim.level import Level
@@ -35,6 +36,24 @@ class HiddenRegion:
     point: tuple[float, float]
 
 
+def places(where: str, lines: Mapping[KeyPath, int], otherwise: str | None = None) -> Place:
+    """Return what names file and line of a key in a YAML file: of the first key given that is there, or else the file.
+
+    A key is a name, or a path such as ("crates", 0), whose nearest line above will do. `otherwise` names the place
+    where none of the keys is there.
+    """
+
+    def place(*keys: str | KeyPath) -> str:
+        for key in keys:
+            path = key if isinstance(key, tuple) else (key,)
+            for end in range(len(path), 0, -1):
+                if path[:end] in lines:
+                    return f"{where}:{lines[path[:end]]}"
+        return otherwise or where
+
+    return place
+
+
 def check_extent(points: NDArray[np.float64], where: str) -> None:
     """Raise InputError if points `[n, 2]` are not finite or so far out that they reach into the world beside."""
     wrong = ~((points >= -MARGIN_M) & (points <= LARGEST_M + MARGIN_M)).all(axis=1)
@@ -50,16 +69,16 @@ def check_level(level: Level, place: Place) -> Level:
     x, y = level.launch
     if not level.is_free(np.array([level.launch]), LAUNCH_CLEARANCE_M)[0]:
         raise InputError(
-            f"{place('launch')}: launch ({x:g}, {y:g}) is in or within {LAUNCH_CLEARANCE_M} m of a wall: "
+            f"{place('launch')}: launch {level.launch} is in or within {LAUNCH_CLEARANCE_M} m of a wall: "
             "move it to where there is room"
         )
     hidden = hidden_regions(level)
     if hidden:
         region = hidden[0]
         raise InputError(
-            f"{place('outline', 'size_m')}: {region.area_m2:.2f} m² around ({region.point[0]:.2f}, {region.point[1]:.2f}) "
-            f"can neither be reached from the launch ({x:g}, {y:g}) nor seen from where drones can fly: open a passage "
-            "of 0.5 m, or make it solid"
+            f"{place('outline', 'size_m', 'extends', 'image')}: {region.area_m2:.2f} m² around "
+            f"({region.point[0]:.2f}, {region.point[1]:.2f}) can neither be reached from the launch ({x:g}, {y:g}) "
+            "nor seen from where drones can fly: open a passage of 0.5 m, or make it solid"
         )
     _check_people(level, place)
     _check_crates(level, place)

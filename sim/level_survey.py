@@ -19,9 +19,10 @@ from imagine.sim.level_kernels import flood, lay_out, see
 LAUNCH_CLEARANCE_M = 0.25
 """A drone starts no closer than this to anything."""
 FLIGHT_CLEARANCE_M = 0.21
-"""How far a drone's centre keeps from anything: half of what its planner, which goes by 0.2 m cells, calls a passage."""
+"""How far a drone's centre keeps from anything, by its planner's 0.2 m cells: 0.47 m is open, 0.42 m is not."""
 SIGHT_M = 4.0
-"""How far drones map."""
+"""How far drones map. The last cell of a beam that ends in the air is not mapped: sight counts one cell less."""
+_NEARBY_M = 1.0
 _FAR_M = 0.6  # clearances beyond are cut
 
 Point = tuple[float, float]
@@ -79,7 +80,7 @@ def survey(geometry: Geometry, launch: Point) -> Survey:
     free = np.ascontiguousarray(inside[1::2, 1::2])
     flyable = np.ascontiguousarray(reached[1::2, 1::2])
     seen = np.zeros((rows, columns), np.bool_)
-    see(seen, free, reached, _looks(), geometry.segments, geometry.circles, column0, row0)
+    see(seen, free, reached, _nearby(), SIGHT_M - CELL, geometry.segments, geometry.circles, column0, row0)
     spot_rows, spot_columns = np.nonzero(flyable & (clearance[1::2, 1::2] > LAUNCH_CLEARANCE_M))
     return Survey(free, flyable, seen, cell_centres(spot_rows, spot_columns, geometry.grid))
 
@@ -87,7 +88,7 @@ def survey(geometry: Geometry, launch: Point) -> Survey:
 def reachable(
     clearance: NDArray[np.float64], grid: Grid, launch: Point, keep_m: float = FLIGHT_CLEARANCE_M
 ) -> NDArray[np.bool_]:
-    """Return the lattice points that hang together with the launch, all `keep_m` clear (none: no room at the launch)."""
+    """Return the lattice points that hang together with the launch, all `keep_m` clear; none where it has no room."""
     open_points = clearance >= keep_m
     reached = np.zeros(open_points.shape, np.bool_)
     row, column = lattice_index(launch, grid)
@@ -118,7 +119,7 @@ def roomiest_point(geometry: Geometry) -> Point:
     for x, y, radius in geometry.circles:
         exact = np.minimum(exact, np.hypot(points[:, 0] - x, points[:, 1] - y) - radius)
     best = int(np.argmax(np.round(exact, 6)))  # rounded: equals are equal on every machine
-    return float(points[best, 0]), float(points[best, 1])
+    return round(float(points[best, 0]), 6), round(float(points[best, 1]), 6)
 
 
 def lattice_point(index: tuple[int, int], grid: Grid) -> Point:
@@ -137,18 +138,11 @@ def cell_centres(rows: NDArray[np.int64], columns: NDArray[np.int64], grid: Grid
 
 
 @functools.cache
-def _looks() -> NDArray[np.int16]:
-    """Return the lattice steps to look from, nearest first: fine nearby, a step of a cell and of two farther off.
-
-    The last cell of a beam that ends in the air is not mapped, so sight counts one cell less.
-    """
-    reach = int(SIGHT_M / CELL * 2.0) - 2
+def _nearby() -> NDArray[np.int16]:
+    """Return the lattice steps (row, column) to points within a metre of a cell's centre, nearest first."""
+    reach = int(_NEARBY_M / CELL * 2.0)
     i, j = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
     squared = i * i + j * j
-    even = (i % 2 == 0) & (j % 2 == 0)
-    quarter = (i % 4 == 0) & (j % 4 == 0)
-    half_metre = int(0.5 / CELL * 2.0)
-    wanted = (squared <= half_metre**2) | even & (squared <= (3 * half_metre) ** 2) | quarter & (squared <= reach**2)
-    wanted &= squared > 0
-    order = np.lexsort((j[wanted], i[wanted], squared[wanted]))
-    return np.ascontiguousarray(np.column_stack((i[wanted], j[wanted]))[order].astype(np.int16))
+    near = np.flatnonzero((squared > 0) & (squared <= reach * reach))
+    order = near[np.lexsort((j[near], i[near], squared[near]))]
+    return np.ascontiguousarray(np.column_stack((i, j))[order].astype(np.int16))

@@ -174,6 +174,7 @@ def _region(
     indoors = np.where(np.isin(labels, edge), 0.0, room)  # what reaches the image's edge is outdoors
     if indoors.max() * frame.resolution >= LAUNCH_CLEARANCE_M + frame.resolution:
         room = indoors
-    row, column = np.unravel_index(int(np.argmax(np.round(room, 6))), room.shape)
+    best = int(np.argmax(np.round(room, 6)))
+    row, column = best // room.shape[1], best % room.shape[1]
     x, y = frame.to_map(np.array([[column + 0.5, row + 0.5]]))[0]
     return labels == labels[row, column], (float(x), float(y))

@@ -30,9 +30,12 @@ def simple_loop(points: Sequence[Sequence[float]] | NDArray[np.float64], where: 
     if len(same):
         first, second = sorted((int(order[same[0]]), int(order[same[0] + 1])))
         raise InputError(
-            f"{where}: corner {first} at {_at(loop[first])} comes again as corner {second}: a polygon passes each corner once"
+            f"{where}: corner {first} at {_at(loop[first])} comes again as corner {second}: "
+            "a polygon passes each corner once"
         )
-    if abs(signed_area(loop)) < _LEAST_AREA_M2:
+    away = loop - loop[0]
+    far = away[np.argmax(np.hypot(away[:, 0], away[:, 1]))]
+    if np.abs(far[0] * away[:, 1] - far[1] * away[:, 0]).max() < _LEAST_AREA_M2:
         raise InputError(
             f"{where}: it encloses no area: an open line from {_at(loop[0])} to {_at(loop[-1])}, not a polygon"
         )
@@ -40,8 +43,8 @@ def simple_loop(points: Sequence[Sequence[float]] | NDArray[np.float64], where: 
     if first >= 0:
         a, b = sorted((first, second))
         raise InputError(
-            f"{where}: it crosses or touches itself at {_at((x, y))}, where edge {a} from {_at(loop[a])} meets edge {b} "
-            f"from {_at(loop[b])}: a polygon has no crossings"
+            f"{where}: it crosses or touches itself at {_at((x, y))}, where edge {a} from {_at(loop[a])} meets "
+            f"edge {b} from {_at(loop[b])}: a polygon has no crossings"
         )
     return loop
 
@@ -52,6 +55,8 @@ def without_spikes(loop: NDArray[np.float64], longest_m: float) -> NDArray[np.fl
     A spike has no width, and so no meaning; one longer than `longest_m` stays, since it may have been meant as a wall.
     """
     corners = [(float(x), float(y)) for x, y in loop]
+    if len(corners) > 1 and corners[0] == corners[-1]:
+        corners.pop()
     k = 0
     while k < len(corners) and len(corners) > 3:
         before, tip, after = corners[k - 1], corners[k], corners[(k + 1) % len(corners)]
