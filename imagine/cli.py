@@ -37,6 +37,10 @@ app = typer.Typer(
 )
 export_app = typer.Typer(help="Turn checkpoints into models that fly.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(export_app, name="export")
+level_app = typer.Typer(
+    help="Look at levels, check them, and generate houses.", no_args_is_help=True, rich_markup_mode=None
+)
+app.add_typer(level_app, name="level")
 
 _SIM_FLAGS = {"level", "drones", "ticks", "speed", "headless", "seed", "port", "map_file", "lockstep"}
 _DRONE_FLAGS = {"vehicle", "lidar", "mesh", "config", "overrides"}
@@ -45,6 +49,10 @@ JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="w
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="override a setting; may be given many times")
 ]
+LevelName = Annotated[
+    str, typer.Argument(help="0 to 6, house:SEED, a level's YAML, a floor plan's JSON, plan.png@0.05")
+]
+LevelImage = Annotated[Path | None, typer.Option("--image", metavar="FILE.png", help="draw the level here")]
 
 
 def main() -> None:
@@ -260,6 +268,55 @@ def export_inspect(model: Path) -> None:
 def _show_inspection(path: Path, found: Any) -> None:
     print(json.dumps(found.contract.model_dump(mode="json"), indent=2))
     print(f"{path}: {found.file_bytes / 1e6:.2f} MB, {found.parameters} weights, hash matches")
+
+
+@level_app.command("list")
+def level_list(json_file: JsonFile = None) -> None:
+    """List the built-in levels."""
+    check_outputs(json_file)
+    from imagine.level_command import list_levels
+
+    list_levels(json_file)
+
+
+@level_app.command("show")
+def level_show(name: LevelName, image: LevelImage = None, json_file: JsonFile = None) -> None:
+    """Show a level's figures, and draw it."""
+    check_outputs(json_file, image, "--image")
+    from imagine.level_command import show_level
+
+    show_level(name, image, json_file)
+
+
+@level_app.command("check")
+def level_check(
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="levels, or files")], json_file: JsonFile = None
+) -> None:
+    """Check that levels can be explored: connected, seen everywhere, with room to start."""
+    check_outputs(json_file)
+    from imagine.level_command import check_levels
+
+    check_levels(names, json_file)
+
+
+@level_app.command("generate")
+def level_generate(
+    seed: Annotated[int, typer.Option(min=0, help="the house's number; with --count the first one's")] = 0,
+    area: Annotated[float | None, typer.Option(help="floor area in m², 50 to 400; without it by chance")] = None,
+    count: Annotated[int, typer.Option(min=1, help="so many houses, of this seed and those after it")] = 1,
+    people: Annotated[int, typer.Option(min=0, max=20, help="so many people walk about")] = 0,
+    crates: Annotated[int, typer.Option(min=0, max=50, help="so many boxes can be pushed")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="FILE.yaml|FOLDER", help="without it to standard output")
+    ] = None,
+    image: LevelImage = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Generate furnished houses, the same for the same seed."""
+    check_outputs(json_file, image, "--image")
+    from imagine.level_command import generate_levels
+
+    generate_levels(seed, area, count, people, crates, out, image, json_file)
 
 
 @app.command()

@@ -16,6 +16,8 @@ from imagine.sim.film import Film
 from imagine.train.atomic_file import write_atomically
 from imagine.train.evaluation import evaluate, named_policy
 
+_HOUSES = "house:"
+_MOST_LEVELS = 1000
 _SHOWN = {
     "level": "level", "drones": "drones", "coverage_mean": "seen", "t90_mean": "T90", "t90_reached": "T90\nreached",
     "t95_mean": "T95", "t99_mean": "T99", "collisions_per_episode": "contacts", "path_m": "path,\nm",
@@ -67,16 +69,25 @@ def _cell(value: object) -> str:
 
 
 def level_list(text: str) -> list[str]:
-    """Return the levels of a list such as 4, 0-6 or 1,3,house.yaml. Raises InputError on an empty range."""
+    """Return the levels of a list such as 4, 0-6 or 1,3,house.yaml; house:0-9 and house:0-9:120 are ten houses each.
+
+    Raises InputError on an empty range.
+    """
     levels: list[str] = []
-    for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
+    for part in (part.strip() for part in text.split(",")):
+        prefix, seeds, area = "", part, ""
+        if part.startswith(_HOUSES):
+            prefix, (seeds, colon, size) = _HOUSES, part.removeprefix(_HOUSES).partition(":")
+            area = colon + size
+        first, dash, last = seeds.partition("-")
         if dash and first.isdecimal() and last.isdecimal():
             if int(last) < int(first):
-                raise InputError(f"--levels {part.strip()}: the range is empty; write {last}-{first}")
-            levels += [str(number) for number in range(int(first), int(last) + 1)]
+                raise InputError(f"--levels {part}: the range is empty; write {prefix}{last}-{first}{area}")
+            if int(last) - int(first) >= _MOST_LEVELS:
+                raise InputError(f"--levels {part}: more than {_MOST_LEVELS} levels; take a shorter range")
+            levels += [f"{prefix}{number}{area}" for number in range(int(first), int(last) + 1)]
         else:
-            levels.append(part.strip())
+            levels.append(part)
     return levels
 
 

@@ -10,10 +10,15 @@ from typing import Any
 from imagine.core.errors import InputError
 
 
-def check_outputs(json_file: Path | None, map_file: Path | None = None, film_file: Path | None = None) -> None:
-    """Raise InputError naming a file that cannot be written; `map_file` needs to be a PNG, `film_file` GIF or MP4."""
+def check_outputs(
+    json_file: Path | None, map_file: Path | None = None, film_file: Path | None = None, map_flag: str = "--map"
+) -> None:
+    """Raise InputError naming a file that cannot be written.
+
+    `map_file`, given as `map_flag`, needs to be a PNG, `film_file` GIF or MP4.
+    """
     if map_file is not None and map_file.suffix.lower() != ".png":
-        raise InputError(f"--map {map_file}: the map is drawn as PNG: name a file that ends in .png")
+        raise InputError(f"{map_flag} {map_file}: what is drawn is a PNG: name a file that ends in .png")
     if film_file is not None:
         from imagine.sim.film import check_film
 

@@ -1,35 +1,31 @@
-"""Levels: the rooms a team explores, read from YAML, in metres.
+"""Levels: the rooms a team explores, in metres.
 
-A level is an outline (free space inside) with walls, boxes and round posts in it, and a launch point. All obstacles
-become convex polygons or circles, and one set of edges serves both the LiDAR and the physics.
+A level is an outline (free space inside) with solids and round posts in it, and a launch point. One set of edges
+serves the LiDAR, the physics and the survey of what can be flown and seen.
 """
 
 from __future__ import annotations
 
-import itertools
+import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import resources
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
-from imagine.core.config import KeyPath, Settings, check_settings, parse_yaml, read_yaml
+from imagine.core.config import Settings
 from imagine.core.errors import InputError
 from imagine.core.frames import Pose
 from imagine.core.raster import CELL, TILE
+from imagine.sim.level_kernels import choose_apart, fill_loop, free_points
+from imagine.sim.level_survey import LAUNCH_CLEARANCE_M, Geometry, Survey, survey
 
 Point = tuple[float, float]
 BUILT_IN = ("0", "1", "2", "3", "4", "5", "6")
 _LAUNCH_SPACING_M = 0.7
-_LAUNCH_CLEARANCE_M = 0.25
-_LARGEST_M = 200.0
-_MARGIN_M = 25.0  # the twin lays worlds 256 m apart, so nothing of a level may reach further out
 
 
 class Box(Settings):
@@ -46,12 +42,9 @@ class Box(Settings):
             raise ValueError("a box needs a positive width and depth")
         return size
 
-
-class Circle(Settings):
-    """A round post."""
-
-    center: Point
-    radius: float = Field(gt=0.0)
+    def corners(self) -> NDArray[np.float64]:
+        """Return the corners `[4, 2]`, counter-clockwise, metres."""
+        return rectangle(self.center, self.size, math.radians(self.yaw_deg))
 
 
 class Person(Settings):
@@ -66,43 +59,6 @@ class Crate(Box):
     """A box that can be pushed; `mass_kg` says how hard it is."""
 
     mass_kg: float = Field(default=2.0, gt=0.0, le=100.0)
-
-
-class LevelFile(Settings):
-    """What a level's YAML holds."""
-
-    title: str = ""
-    extends: str | None = Field(default=None, description="a built-in level that this one adds to")
-    size_m: Point | None = Field(default=None, description="width and depth of a rectangular outline")
-    outline: list[Point] | None = Field(default=None, min_length=3, description="or the outline itself")
-    launch: Point | None = None
-    wall_thickness_m: float = Field(default=0.1, gt=0.0, le=1.0)
-    walls: list[list[Point]] = Field(default_factory=list, description="polylines")
-    boxes: list[Box] = Field(default_factory=list)
-    circles: list[Circle] = Field(default_factory=list)
-    people: list[Person] = Field(default_factory=list)
-    crates: list[Crate] = Field(default_factory=list)
-
-    @field_validator("size_m")
-    @classmethod
-    def _of_a_building(cls, size: Point | None) -> Point | None:
-        if size is not None and not all(0.5 <= side <= _LARGEST_M for side in size):
-            raise ValueError(f"each side must lie within 0.5 and {_LARGEST_M:g} m")
-        return size
-
-    @field_validator("walls")
-    @classmethod
-    def _two_points(cls, walls: list[list[Point]]) -> list[list[Point]]:
-        for wall in walls:
-            if len(wall) < 2:
-                raise ValueError("a wall is a line of at least two points")
-        return walls
-
-    @model_validator(mode="after")
-    def _one_outline(self) -> LevelFile:
-        if self.extends is None and (self.size_m is None) == (self.outline is None):
-            raise ValueError("give either size_m or outline")
-        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,39 +95,64 @@ class Level:
         columns, rows = (high - low) * TILE
         return int(low[0] * TILE), int(low[1] * TILE), int(columns), int(rows)
 
-    def is_free(self, points: NDArray[np.float64], clearance_m: float = 0.0) -> NDArray[np.bool_]:
-        """Tell which points `[n, 2]` lie inside the outline, outside all obstacles, and `clearance_m` off any edge."""
-        free = _inside(self.outline, points)
-        for polygon in (*self.polygons, *self.solids):
-            free &= ~_inside(polygon, points)
-        for x, y, radius in self.circles:
-            free &= np.hypot(points[:, 0] - x, points[:, 1] - y) > radius + clearance_m
-        if clearance_m > 0.0:
-            free[free] = _distance_to_segments(points[free], self.segments) > clearance_m
-        return free
+    @cached_property
+    def geometry(self) -> Geometry:
+        """What stands still, as the survey takes it."""
+        loops = (*self.polygons, *self.solids)
+        return Geometry(np.ascontiguousarray(self.outline), loops, self.segments, self.circles, self.grid)
+
+    @cached_property
+    def survey(self) -> Survey:
+        """What can be flown and seen among all that stands still."""
+        return survey(self.geometry, self.launch)
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """The cells whose centres lie inside the outline and in no solid, bool `[rows, columns]`."""
+        return self.survey.free
+
+    @property
+    def flyable(self) -> NDArray[np.bool_]:
+        """The cells whose centres a drone's centre can get to from the launch, bool `[rows, columns]`.
+
+        A passage of 0.5 m is open, one of 0.4 m is not. Crates, which give way, do not count.
+        """
+        return self.survey.flyable
 
     @cached_property
     def coverable(self) -> NDArray[np.bool_]:
-        """The cells whose centres are free and connected to the launch point, bool `[rows, columns]` of `grid`."""
-        free = self._free_cells(0.0)
-        column0, row0, _, _ = self.grid
-        seed = math.floor(self.launch[1] / CELL) - row0, math.floor(self.launch[0] / CELL) - column0
-        return _flood(free, seed)
+        """The free cells that a drone can see from where it can fly, at most 4 m away, bool `[rows, columns]`.
+
+        Cells under a crate are left out: nobody sees them while it stands there.
+        """
+        if not self.crates:
+            return self.survey.seen
+        column0, row0, columns, rows = self.grid
+        under = np.zeros((2 * rows + 1, 2 * columns + 1), np.uint8)
+        for crate in self.crates:
+            fill_loop(under, crate.corners(), column0, row0, 1)
+        open_cells: NDArray[np.bool_] = self.survey.seen & (under[1::2, 1::2] == 0)
+        return open_cells
 
     @cached_property
-    def flyable(self) -> NDArray[np.bool_]:
-        """The cells a drone's centre can reach from the launch with room to spare, bool `[rows, columns]`."""
-        free = self._free_cells(_LAUNCH_CLEARANCE_M)
-        column0, row0, _, _ = self.grid
-        seed = math.floor(self.launch[1] / CELL) - row0, math.floor(self.launch[0] / CELL) - column0
-        return _flood(free, seed)
+    def launch_spots(self) -> NDArray[np.float64]:
+        """The flyable cells' centres `[n, 2]` from which a drone may start: 0.25 m from walls, crates and people."""
+        spots = self.survey.spots
+        for crate in self.crates:
+            spots = spots[_distance_to_box(spots, crate) > LAUNCH_CLEARANCE_M]
+        for person in self.people:
+            x, y = person.loop[0]
+            spots = spots[np.hypot(spots[:, 0] - x, spots[:, 1] - y) > person.radius + LAUNCH_CLEARANCE_M]
+        return np.ascontiguousarray(spots)
 
-    def _free_cells(self, clearance_m: float) -> NDArray[np.bool_]:
-        column0, row0, columns, rows = self.grid
-        x = (np.arange(columns) + column0 + 0.5) * CELL
-        y = (np.arange(rows) + row0 + 0.5) * CELL
-        centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        return self.is_free(centres, clearance_m).reshape(rows, columns)
+    def is_free(self, points: NDArray[np.float64], clearance_m: float = 0.0) -> NDArray[np.bool_]:
+        """Tell which points `[n, 2]` lie inside the outline, outside all obstacles, and `clearance_m` off any edge."""
+        free = np.empty(len(points), np.bool_)
+        free_points(
+            free, np.ascontiguousarray(points, np.float64), clearance_m, self.outline, *self.geometry.packed,
+            self.segments, self.circles,
+        )  # fmt: skip
+        return free
 
     def launch_poses(self, drones: int, generator: np.random.Generator | None = None) -> list[Pose]:
         """Return launch poses 0.7 m apart, nearest to the launch point first, heading along x.
@@ -179,100 +160,43 @@ class Level:
         With a generator the team starts around a random reachable point instead, with random headings. Raises
         InputError where there is no room for so many drones.
         """
-        column0, row0, _, _ = self.grid
-        rows, columns = np.nonzero(self.flyable)
-        centres = np.column_stack(((columns + column0 + 0.5) * CELL, (rows + row0 + 0.5) * CELL))
-        around = np.array(self.launch)
-        if generator is not None and len(centres):
-            around = centres[generator.integers(len(centres))]
-        order = np.argsort(np.hypot(*(centres - around).T), kind="stable")
-        chosen: list[NDArray[np.float64]] = []
-        for point in centres[order]:
-            if all(math.dist(point, other) >= _LAUNCH_SPACING_M for other in chosen):
-                chosen.append(point)
-                if len(chosen) == drones:
-                    break
-        if len(chosen) < drones:
+        spots = self.launch_spots
+        x, y = self.launch
+        if generator is not None and len(spots):
+            x, y = spots[generator.integers(len(spots))]
+        chosen = np.empty(drones, np.int64)
+        found = choose_apart(spots, x, y, drones, _LAUNCH_SPACING_M, chosen)
+        if found < drones:
             raise InputError(
-                f"level {self.name}: room for {len(chosen)} drones around ({around[0]:g}, {around[1]:g}), not {drones}"
+                f"level {self.name}: room for {found} drones around ({x:g}, {y:g}), not {drones}: "
+                "they start 0.7 m apart and 0.25 m from anything; take fewer, or a larger level"
             )
         headings = np.zeros(drones) if generator is None else generator.uniform(-math.pi, math.pi, drones)
-        return [Pose(float(p[0]), float(p[1]), float(h)) for p, h in zip(chosen, headings, strict=True)]
+        return [Pose(float(spots[k, 0]), float(spots[k, 1]), float(h)) for k, h in zip(chosen, headings, strict=True)]
+
+    def fingerprint(self) -> str:
+        """Return a hash of the geometry, people and crates: equal levels have equal ones, whatever they are called."""
+        digest = hashlib.sha256(np.array(self.launch).tobytes())
+        for array in (self.outline, self.circles, *self.polygons, *self.solids):
+            digest.update(len(array).to_bytes(4, "little") + np.ascontiguousarray(array, np.float64).tobytes())
+        for moving in (*self.people, *self.crates):
+            digest.update(moving.model_dump_json().encode())
+        return digest.hexdigest()
 
 
 def load_level(name: str) -> Level:
-    """Return a built-in level by its name ("0" to "6") or one from a YAML file.
+    """Return a level by its name: built in ("0" to "6"), generated ("house:7", "house:7:120"), or from a file.
 
-    Raises InputError naming the file, line and key, or listing the built-in levels.
+    Files are a level's YAML, a floor plan's JSON, a map's YAML with its image, or "plan.png@0.05", an image and its
+    metres a pixel. Raises InputError naming the file, the line where it has lines, and the coordinates.
     """
-    if name in BUILT_IN:
-        text = resources.files("imagine.sim").joinpath(f"levels/{name}.yaml").read_text(encoding="utf-8")
-        data, lines = parse_yaml(text, f"level {name}")
-        return _build(name, f"level {name}", data, lines)
-    path = Path(name)
-    if path.suffix not in (".yaml", ".yml") or not path.exists():
-        raise InputError(f"unknown level '{name}': give one of {', '.join(BUILT_IN)} or a YAML file that exists")
-    data, lines = read_yaml(path)
-    return _build(path.stem, str(path), data, lines)
+    from imagine.sim.level_source import open_level  # which makes Levels, and so imports this file
+
+    return open_level(name)
 
 
-def _build(name: str, where: str, data: dict[str, Any], lines: dict[KeyPath, int]) -> Level:
-    file = check_settings(LevelFile, data, where, lines)
-    base: Level | None = None
-    if file.extends is not None:
-        if file.extends not in BUILT_IN or file.extends == name:
-            raise InputError(f"{where}:{lines.get(('extends',), 1)}: extends: give one of {', '.join(BUILT_IN)}")
-        base = load_level(file.extends)
-    outline = _outline(file, base)
-    polygons = [p for wall in file.walls for p in _wall_boxes(wall, file.wall_thickness_m)]
-    polygons += [_rectangle(b.center, b.size, math.radians(b.yaw_deg)) for b in file.boxes]
-    circles = np.array([[*c.center, c.radius] for c in file.circles], float).reshape(-1, 3)
-    launch = file.launch or (base.launch if base else None)
-    if launch is None:
-        raise InputError(f"{where}: key 'launch' is missing: the point where the team starts, [x, y] in metres")
-    if base is not None:
-        polygons = [*base.polygons, *polygons]
-        circles = np.concatenate((base.circles, circles))
-    _check_extent(file, where, lines)
-    people, crates = tuple(file.people), tuple(file.crates)
-    solids: tuple[NDArray[np.float64], ...] = ()
-    if base is not None:
-        people, crates, solids = (*base.people, *people), (*base.crates, *crates), base.solids
-    level = Level(name, file.title, outline, tuple(polygons), circles, launch, solids, people, crates)
-    if not level.is_free(np.array([launch]), _LAUNCH_CLEARANCE_M)[0]:
-        raise InputError(
-            f"{where}:{lines.get(('launch',), 1)}: launch {launch} is in or within {_LAUNCH_CLEARANCE_M} m of a wall"
-        )
-    return level
-
-
-def _check_extent(file: LevelFile, where: str, lines: dict[KeyPath, int]) -> None:
-    """Refuse geometry so far out that it would take all memory or reach into the world beside."""
-    groups: dict[str, list[list[Point]]] = {
-        "outline": [[point] for point in file.outline or ()],
-        "walls": [list(wall) for wall in file.walls],
-        "boxes": [[box.center, (box.center[0] + max(box.size), box.center[1] + max(box.size))] for box in file.boxes],
-        "circles": [[post.center, (post.center[0] + post.radius, post.center[1])] for post in file.circles],
-    }
-    for key, items in groups.items():
-        for index, points in enumerate(items):
-            if not all(-_MARGIN_M <= c <= _LARGEST_M + _MARGIN_M for point in points for c in point):
-                line = lines.get((key, index), lines.get((key,), 1))
-                least, most = -_MARGIN_M, _LARGEST_M + _MARGIN_M
-                raise InputError(f"{where}:{line}: {key}.{index}: a level lies within {least:g} and {most:g} m")
-
-
-def _outline(file: LevelFile, base: Level | None) -> NDArray[np.float64]:
-    if file.outline is not None:
-        return np.array(file.outline, float)
-    if file.size_m is not None:
-        width, depth = file.size_m
-        return np.array([[0.0, 0.0], [width, 0.0], [width, depth], [0.0, depth]])
-    assert base is not None  # LevelFile demands an outline of a level that extends none
-    return base.outline
-
-
-def _rectangle(center: Point, size: Point, yaw: float) -> NDArray[np.float64]:
+def rectangle(center: Point, size: Point, yaw: float) -> NDArray[np.float64]:
+    """Return the corners `[4, 2]` of a rectangle turned counter-clockwise by `yaw` radians."""
     half = np.array(size) / 2.0
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
     c, s = math.cos(yaw), math.sin(yaw)
@@ -280,52 +204,12 @@ def _rectangle(center: Point, size: Point, yaw: float) -> NDArray[np.float64]:
     return turned
 
 
-def _wall_boxes(points: Sequence[Point], thickness: float) -> list[NDArray[np.float64]]:
-    """Return a box for every stretch of a wall, half a thickness longer at both ends so that corners close."""
-    boxes = []
-    for (x0, y0), (x1, y1) in itertools.pairwise(points):
-        length = math.hypot(x1 - x0, y1 - y0)
-        center = ((x0 + x1) / 2.0, (y0 + y1) / 2.0)
-        boxes.append(_rectangle(center, (length + thickness, thickness), math.atan2(y1 - y0, x1 - x0)))
-    return boxes
-
-
-def _inside(polygon: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which points lie in a simple polygon, by the crossing number."""
-    inside = np.zeros(len(points), bool)
-    x, y = points[:, 0], points[:, 1]
-    for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        if y0 == y1:
-            continue
-        crosses = ((y0 > y) != (y1 > y)) & (x < (x1 - x0) * (y - y0) / (y1 - y0) + x0)
-        inside ^= crosses
-    return inside
-
-
-def _distance_to_segments(points: NDArray[np.float64], segments: NDArray[np.float64]) -> NDArray[np.float64]:
-    best = np.full(len(points), np.inf)
-    for x0, y0, x1, y1 in segments:
-        dx, dy = x1 - x0, y1 - y0
-        t = np.clip(((points[:, 0] - x0) * dx + (points[:, 1] - y0) * dy) / max(dx * dx + dy * dy, 1e-12), 0.0, 1.0)
-        best = np.minimum(best, np.hypot(points[:, 0] - x0 - t * dx, points[:, 1] - y0 - t * dy))
-    return best
-
-
-def _flood(free: NDArray[np.bool_], seed: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return the 4-connected region of `free` that holds `seed` (row, column)."""
-    reached = np.zeros_like(free)
-    if not free[seed]:
-        return reached
-    stack = [seed]
-    reached[seed] = True
-    rows, columns = free.shape
-    while stack:
-        row, column = stack.pop()
-        for i, j in ((row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)):
-            if 0 <= i < rows and 0 <= j < columns and free[i, j] and not reached[i, j]:
-                reached[i, j] = True
-                stack.append((i, j))
-    return reached
+def _distance_to_box(points: NDArray[np.float64], box: Box) -> NDArray[np.float64]:
+    yaw = math.radians(box.yaw_deg)
+    c, s = math.cos(yaw), math.sin(yaw)
+    local = np.abs((points - np.array(box.center)) @ np.array([[c, -s], [s, c]])) - np.array(box.size) / 2.0
+    distance: NDArray[np.float64] = np.hypot(*np.maximum(local, 0.0).T)
+    return distance
 
 
 def mirrored(level: Level, swap_axes: bool, flip_x: bool, flip_y: bool) -> Level:
