@@ -282,7 +282,7 @@ def level_list(json_file: JsonFile = None) -> None:
 @level_app.command("show")
 def level_show(name: LevelName, image: LevelImage = None, json_file: JsonFile = None) -> None:
     """Show a level's figures, and draw it."""
-    check_outputs(json_file, image, "--image")
+    check_outputs(json_file, image, map_flag="--image")
     from imagine.level_command import show_level
 
     show_level(name, image, json_file)
@@ -313,7 +313,7 @@ def level_generate(
     json_file: JsonFile = None,
 ) -> None:
     """Generate furnished houses, the same for the same seed."""
-    check_outputs(json_file, image, "--image")
+    check_outputs(json_file, image, map_flag="--image")
     from imagine.level_command import generate_levels
 
     generate_levels(seed, area, count, people, crates, out, image, json_file)

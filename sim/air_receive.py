@@ -20,8 +20,10 @@ _EXTRAPOLATE_S = 1.0  # as in mesh_comm.peers
 
 
 @numba.njit(cache=True, nogil=True)
-def deliver(air, world, tick, key, poses, segments, layers, versions, dirty):  # type: ignore[no-untyped-def]
+def deliver(air, world, tick, key, poses, alive, segments, layers, versions, dirty):  # type: ignore[no-untyped-def]
     """Deliver what has arrived in `world` by `tick` to all who hear it at `poses` (`[drones, 2 or more]`, metres).
+
+    Drones not `alive` (bool `[drones]`) neither hear nor are heard.
 
     `segments` `[n, 4]` are the faces of the walls; `key` (uint64) draws the losses, so that a world does not depend on
     what else runs. Writes peers' evidence into `layers` (int8 `[holder, source, rows, columns]`) and `versions`
@@ -34,6 +36,8 @@ def deliver(air, world, tick, key, poses, segments, layers, versions, dirty):  #
     fill_reach(reach, poses, segments, rules.propagation)
     for sender in range(drones):
         for receiver in range(drones):
+            if not (alive[sender] and alive[receiver]):
+                reach[sender, receiver] = 0
             links[sender, receiver].ticks += reach[sender, receiver]
     now = tick / rules.ticks_per_s
     while True:

@@ -49,8 +49,8 @@ _ROWS, _PLACES, _SOURCES, _STALE, _MISSING = 1 << 12, 1 << 24, 1 << 6, 1 << 24, 
 
 
 @numba.njit(cache=True, nogil=True)
-def send(air, world, tick, poses, velocity, ranges, marks, mark_corner, clocks, layers, versions):  # type: ignore[no-untyped-def]
-    """Let every drone of `world` say at `tick` what it has to say; call it when own scans have been integrated.
+def send(air, world, tick, poses, velocity, alive, ranges, marks, mark_corner, clocks, layers, versions):  # type: ignore[no-untyped-def]
+    """Let every drone of `world` that is `alive` say at `tick` what it has to say; call it when own scans have been integrated.
 
     `poses` `[drones, 3]` and `velocity` `[drones, 2 or more]` in the map frame; `ranges` float32 `[drones, beams]` as
     they were mapped; `marks` int8 `[drones, side, side]` the evidence of each drone's scan around its cell, the first
@@ -62,6 +62,8 @@ def send(air, world, tick, poses, velocity, ranges, marks, mark_corner, clocks, 
     now = tick / rules.ticks_per_s
     nodes, messages, counters, peers = air.nodes[world], air.messages[world], air.counters[world], air.peers[world]
     for drone in range(layers.shape[0]):
+        if not alive[drone]:
+            continue
         node = nodes[drone]
         node.tokens = min(rules.burst, node.tokens + rules.budget_rate / rules.ticks_per_s)
         live = 0  # a bit for each peer in touch

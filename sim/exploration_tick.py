@@ -110,8 +110,8 @@ def tick_worlds(first, last, observes, batch, specs, sensors, flight, discs, edg
         began = _lap(scratch, OBSERVING, began)
         maps = batch.maps
         send(
-            batch.air, world, batch.ticks[world], batch.estimates[world], batch.velocity[world], batch.ranges[world],
-            scratch.marks, scratch.corners, maps.clocks[world], maps.layers[world], maps.versions[world],
+            batch.air, world, batch.ticks[world], batch.estimates[world], batch.velocity[world], batch.alive[world],
+            batch.ranges[world], scratch.marks, scratch.corners, maps.clocks[world], maps.layers[world], maps.versions[world],
         )  # fmt: skip
         _lap(scratch, SPEAKING, began)
 
@@ -154,16 +154,17 @@ def _hear(world, batch, sensors):  # type: ignore[no-untyped-def]
     maps, levels, row = batch.maps, sensors.levels, sensors.rows[world]
     walls = levels.edges[row, : levels.shape[row, 2]]
     deliver(
-        batch.air, world, batch.ticks[world], batch.keys[world], batch.poses[world], walls, maps.layers[world],
+        batch.air, world, batch.ticks[world], batch.keys[world], batch.poses[world], batch.alive[world], walls,
+        maps.layers[world],
         maps.versions[world], maps.dirty[world],
     )  # fmt: skip
-    drones = batch.poses.shape[1]
+    drones, peers = batch.poses.shape[1], batch.air.peers[world]
     for drone in range(drones):
         for peer in range(drones):
             place = batch.places[world, drone, peer]
             place[0], place[1] = np.nan, np.nan
             if peer != drone:
-                x, y, known = peer_place(batch.air, world, batch.ticks[world], drone, peer)
+                x, y, known = peer_place(peers[drone, peer], batch.ticks[world], batch.air.rules)
                 if known:
                     place[0], place[1] = x, y
 
