@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from imagine.core.errors import InputError
 from imagine.core.lidar import TEAMMATE_RADIUS_M
 from imagine.sim.air import Air
-from imagine.sim.air_receive import claim_own
+from imagine.sim.air_receive import claim_all
 from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
 from imagine.sim.decision_state import DecisionState
 from imagine.sim.exploration_settings import ExplorationSettings
@@ -264,10 +264,7 @@ class Exploration:
 
     def _metrics(self, world: int) -> EpisodeMetrics:
         maps, twin, own = self.maps, self.twin, range(self.drones)
-        for drone in own:
-            claim_own(
-                self.air.state, world, drone, maps.layers[world, drone, drone], maps.versions[world, drone, drone]
-            )
+        claim_all(self.air.state, world, maps.layers[world], maps.versions[world])
         totals = EpisodeTotals(
             level=twin.levels[world].name,
             coverable=int(maps.coverable_cells[world]),
@@ -275,8 +272,8 @@ class Exploration:
             discovered=maps.discovered[world],
             known=(maps.layers[world, own, own] != 0).sum(axis=(1, 2)),
             contacts=np.stack((twin.wall_contacts[world], twin.drone_contacts[world], twin.mover_contacts[world]), -1),
-            bytes_by=self.air.state.bytes_sent[world],
-            cells_by=self.air.state.cells_known[world],
+            bytes_by=self.air.bytes_sent[world],
+            cells_by=self.air.cells_known[world],
         )
         return self._recorder.finish(world, totals)
 
