@@ -9,15 +9,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.sim.house_layout import Dice, Door, Layout, Rect, Room
+from imagine.sim.dice import Dice
+from imagine.sim.furniture_kinds import ALONG_WALLS, Kind, Range
+from imagine.sim.house_layout import Door, Layout, Rect, Room
 
 KEPT_OPEN_M = 0.3
 """Ways through furnished rooms are at least twice as wide as this."""
 _STEP_M = 0.1
 _DOOR_ZONE_M = 0.85  # nothing stands so close before a door
 _TRIES = 4
-
-Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -38,48 +38,6 @@ class Piece:
         half_y = self.radius or (self.size[0] * s + self.size[1] * c) / 2.0
         x, y = self.center
         return Rect(x - half_x, y - half_y, x + half_x, y + half_y)
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """What a kind of furniture measures along the wall and away from it, metres."""
-
-    width: Range
-    depth: Range
-    corner: bool = False
-
-
-_BED = _Kind((1.4, 1.8), (2.0, 2.1))
-_SINGLE_BED = _Kind((0.9, 1.0), (2.0, 2.1), corner=True)
-_WARDROBE = _Kind((1.2, 2.4), (0.58, 0.65), corner=True)
-_CHEST = _Kind((0.8, 1.3), (0.42, 0.5))
-_DESK = _Kind((1.2, 1.6), (0.6, 0.8))
-_SOFA = _Kind((1.8, 2.6), (0.85, 1.0))
-_BOARD = _Kind((1.2, 2.0), (0.38, 0.5))
-_SHELF = _Kind((0.8, 2.2), (0.3, 0.4), corner=True)
-_PIANO = _Kind((1.4, 1.5), (0.6, 0.65))
-_COUNTER = _Kind((1.8, 3.4), (0.6, 0.65), corner=True)
-_FRIDGE = _Kind((0.6, 0.75), (0.6, 0.7), corner=True)
-_TUB = _Kind((1.6, 1.8), (0.7, 0.8), corner=True)
-_SHOWER = _Kind((0.8, 1.0), (0.8, 1.0), corner=True)
-_BASIN = _Kind((0.5, 0.9), (0.45, 0.5))
-_TOILET = _Kind((0.38, 0.42), (0.6, 0.7))
-_WASHER = _Kind((0.6, 0.6), (0.6, 0.65), corner=True)
-_RACK = _Kind((1.0, 2.6), (0.4, 0.6), corner=True)
-_CABINET = _Kind((0.7, 1.2), (0.3, 0.36))
-
-# what stands against the walls of each room, with its probability, in the order in which it is placed
-_ALONG_WALLS: dict[str, tuple[tuple[_Kind, float], ...]] = {
-    "bedroom": ((_BED, 0.65), (_WARDROBE, 0.95), (_DESK, 0.5), (_CHEST, 0.6), (_SHELF, 0.4)),
-    "child": ((_SINGLE_BED, 1.0), (_WARDROBE, 0.8), (_DESK, 0.9), (_SHELF, 0.7), (_SINGLE_BED, 0.25)),
-    "living": ((_SOFA, 0.9), (_BOARD, 0.9), (_SHELF, 0.8), (_SHELF, 0.5), (_PIANO, 0.2), (_CHEST, 0.4)),
-    "dining": ((_BOARD, 0.7), (_SHELF, 0.5), (_CHEST, 0.4)),
-    "kitchen": ((_COUNTER, 1.0), (_COUNTER, 0.7), (_FRIDGE, 0.9), (_CABINET, 0.5)),
-    "bath": ((_TUB, 0.6), (_SHOWER, 0.5), (_TOILET, 0.9), (_BASIN, 0.9), (_WASHER, 0.5)),
-    "study": ((_DESK, 1.0), (_SHELF, 0.9), (_SHELF, 0.8), (_SOFA, 0.3), (_CHEST, 0.4)),
-    "store": ((_RACK, 1.0), (_RACK, 0.9), (_RACK, 0.6), (_WASHER, 0.3)),
-    "corridor": ((_CABINET, 0.5), (_CABINET, 0.3)),
-}
 
 
 @dataclass
@@ -228,7 +186,7 @@ def _draw_kinds(dice: Dice, layout: Layout) -> list[str]:
 def _furnish_room(dice: Dice, space: _Space, clutter: float) -> None:
     rounds = 1 + int(space.room.rect.area > 28.0) + int(space.room.rect.area > 45.0)
     for _ in range(rounds):
-        for kind, probability in _ALONG_WALLS[space.kind]:
+        for kind, probability in ALONG_WALLS[space.kind]:
             if dice.chance(probability * clutter):
                 _against_wall(dice, space, kind)
         if space.kind in ("living", "dining", "kitchen") and dice.chance(0.8 * clutter):
@@ -243,7 +201,7 @@ def _furnish_room(dice: Dice, space: _Space, clutter: float) -> None:
         _post(dice, space, (0.15, 0.3))
 
 
-def _against_wall(dice: Dice, space: _Space, kind: _Kind) -> bool:
+def _against_wall(dice: Dice, space: _Space, kind: Kind) -> bool:
     rect = space.room.rect
     width, depth = dice.between(*kind.width), dice.between(*kind.depth)
     for _ in range(_TRIES):

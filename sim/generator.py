@@ -8,8 +8,9 @@ import numpy as np
 from scipy import ndimage
 
 from imagine.core.errors import InputError
+from imagine.sim.dice import Dice
 from imagine.sim.furniture import KEPT_OPEN_M, Furnished, Piece, furnish
-from imagine.sim.house_layout import WALL_M, Dice, Layout, draw_layout
+from imagine.sim.house_layout import WALL_M, Layout, draw_layout
 from imagine.sim.level import Box, Crate, Level, Person, Point
 from imagine.sim.level_check import check_level, hidden_regions
 from imagine.sim.level_file import Circle, LevelFile, build_level

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
-import numpy as np
+from imagine.sim.dice import Dice
 
 Point = tuple[float, float]
-T = TypeVar("T")
 
 WALL_M = 0.1
 _DOOR_M = (0.8, 1.1)
@@ -20,30 +17,6 @@ _JAMB_M = 0.1  # of wall at least between a door and the corner
 _CORRIDOR_M = (1.2, 1.7)
 _CORRIDOR_AREA_M2 = 70.0  # larger floors are divided by a corridor
 _EVEN = 4  # draws of a room's size: the mean of so many
-
-
-class Dice:
-    """Draws from a generator by its uniform numbers alone, which numpy keeps the same from version to version."""
-
-    def __init__(self, generator: np.random.Generator) -> None:
-        """Draw from this generator."""
-        self._generator = generator
-
-    def between(self, low: float, high: float) -> float:
-        """Return a number from low to high, rounded to centimetres."""
-        return round(low + (high - low) * float(self._generator.random()), 2)
-
-    def chance(self, probability: float) -> bool:
-        """Return True with this probability."""
-        return float(self._generator.random()) < probability
-
-    def pick(self, items: Sequence[T]) -> T:
-        """Return one of some items."""
-        return items[min(int(float(self._generator.random()) * len(items)), len(items) - 1)]
-
-    def unit(self) -> float:
-        """Return a number from 0 to 1."""
-        return float(self._generator.random())
 
 
 @dataclass(frozen=True)

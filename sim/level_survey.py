@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from imagine.core.raster import CELL
-from imagine.sim.level_kernels import flood, lay_out, see
+from imagine.sim.level_kernels import flood, lay_out
+from imagine.sim.sight_kernels import see
 
 LAUNCH_CLEARANCE_M = 0.25
 """A drone starts no closer than this to anything."""

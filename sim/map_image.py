@@ -24,7 +24,7 @@ from imagine.sim.pixel_loops import boundary_loops, simplified, without_pinches
 from imagine.sim.polygon import signed_area
 
 IMAGE_SUFFIXES = (".png", ".pgm", ".bmp")
-_MOST_PIXELS = 64_000_000
+_MOST_PIXELS = 16_000_000
 _OPAQUE = 128
 
 
@@ -107,15 +107,17 @@ def read_shades(path: Path, where: str) -> NDArray[np.float64]:
                 raise InputError(f"{where}: {path}: {width} × {height} pixels are too many: scale it down")
             transparent = "A" in picture.getbands() or "transparency" in picture.info
             wide = picture.mode in ("I", "F") or picture.mode.startswith("I;16")
-            pixels = np.asarray(picture if wide else picture.convert("RGBA" if transparent else "RGB"), float)
+            grey = picture.mode in ("1", "L") and not transparent
+            mode = "L" if grey else "RGBA" if transparent else "RGB"
+            pixels = np.asarray(picture if wide else picture.convert(mode))
     except Image.DecompressionBombError as error:
         raise InputError(f"{where}: {path}: too many pixels: scale it down") from error
     except (OSError, SyntaxError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is not an image, or it is cut short"
         raise InputError(f"{where}: {path}: cannot be read: {reason}") from error
     if pixels.ndim == 2:
-        return pixels / (65535.0 if pixels.max(initial=0.0) > 255.0 else 255.0)
-    shades: NDArray[np.float64] = pixels[..., :3].mean(axis=2) / 255.0
+        return np.asarray(pixels / (65535.0 if pixels.max(initial=0) > 255 else 255.0), np.float64)
+    shades: NDArray[np.float64] = pixels[..., :3].mean(axis=2, dtype=np.float64) / 255.0
     if transparent:
         shades[pixels[..., 3] < _OPAQUE] = np.nan
     return shades

@@ -16,8 +16,9 @@ from imagine.core.errors import InputError
 from imagine.core.lidar import LidarSpec
 from imagine.core.raster import CELL
 from imagine.sim.coverage import Coverage
+from imagine.sim.dice import Dice
 from imagine.sim.generator import AREA_M2, ROOM_TO_FLY_M, generate_file, generate_level
-from imagine.sim.house_layout import Dice, Rect, draw_layout
+from imagine.sim.house_layout import Rect, draw_layout
 from imagine.sim.level import Level, load_level
 from imagine.sim.level_check import hidden_regions, room_for
 from imagine.sim.level_file import level_text

@@ -15,6 +15,16 @@ ROOM = "size_m: [8, 6]\nlaunch: [1, 1]\n"
 PEOPLE = ROOM + "boxes:\n  - {center: [4, 3], size: [1, 1]}\npeople:\n"
 
 
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "levels.md"
+
+
+def test_the_example_of_the_documentation_is_a_level(tmp_path: Path) -> None:
+    example = DOCS.read_text(encoding="utf-8").split("```yaml\n")[1].split("```")[0]
+    level = load_level(write(tmp_path, example))
+    assert (len(level.solids), len(level.people), len(level.crates), len(level.circles)) == (1, 1, 1, 1)
+    assert level.coverable.sum() * CELL * CELL == pytest.approx(46.0, abs=1.0)
+
+
 def write(folder: Path, text: str) -> str:
     path = folder / "mine.yaml"
     path.write_text(text, encoding="utf-8")
