@@ -6,8 +6,8 @@ new scans become evidence, maps over the radio, observations and reward.
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,21 +21,13 @@ from imagine.sim.air_receive import claim_all
 from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
 from imagine.sim.decision_state import DecisionState
 from imagine.sim.exploration_settings import ExplorationSettings
-from imagine.sim.exploration_tick import (
-    FLYING,
-    LAUNCHING,
-    STAGE_NAMES,
-    WAITING,
-    Batch,
-    Specs,
-    tick_worlds,
-)
+from imagine.sim.exploration_tick import FLYING, LAUNCHING, STAGES, WAITING, Specs, fly, observe, scan, share
 from imagine.sim.keyed_noise import root_keys
 from imagine.sim.level import Level, load_level, mirrored
 from imagine.sim.metrics import EpisodeMetrics, EpisodeTotals, Recorder
 from imagine.sim.planner_actions import plan_worlds
 from imagine.sim.reward import rewards, survivors, sweep_cells
-from imagine.sim.team_maps import TeamMaps
+from imagine.sim.team_maps import Scratch, TeamMaps, derive
 from imagine.sim.twin import TICK_S, Twin
 
 __all__ = ["CRITIC_CELLS", "CRITIC_CHANNELS", "EpisodeMetrics", "Exploration", "Observation", "Step"]
@@ -120,26 +112,17 @@ class Exploration:
         """The newest turn of every drone's LiDAR, `[worlds, drones, beams]`: metres, inf no return, nan invalid."""
         self.estimates = self.twin.poses
         self._specs = _specs(settings, self.decisions)
+        self.stage_seconds: dict[str, float] = {}
         self._sight_m = max(cap + 2.0 * TEAMMATE_RADIUS_M, settings.observation.lidar_range_m)
-        batch = self._new_batch(keys)
-        self._batches = batch, batch._replace(**self._observation_arrays())
-        self._turn = 0
+        self._keys = root_keys(seed ^ _AIR_KEY, np.array(keys))
+        self._turns = np.zeros(worlds, np.int64)
+        self._setpoints = np.zeros((worlds, drones, 3))
+        self._observed = self._observation_arrays(), self._observation_arrays()
+        self._now = 0
 
-    def _new_batch(self, keys: list[int]) -> Batch:
+    def _observation_arrays(self) -> dict[str, NDArray[np.float32]]:
         size = (self.worlds, self.drones)
-        return Batch(
-            modes=np.zeros(self.worlds, np.int64), ticks=self.ticks, scans=np.zeros(self.worlds, np.int64),
-            keys=root_keys(self.seed ^ _AIR_KEY, np.array(keys)), intents=self.decisions.intents,
-            setpoints=np.zeros((*size, 3)), poses=self.twin.poses, velocity=self.twin.velocity,
-            estimates=self.estimates, alive=self.twin.alive, places=np.full((*size, self.drones, 2), np.nan),
-            ranges=self.ranges, maps=self.maps.arrays, pens=self.maps.pens, air=self.air.state,
-            **self._observation_arrays(),
-        )  # fmt: skip
-
-    def _observation_arrays(self) -> dict[str, Any]:
-        shapes = self.settings.observation.shapes
-        names = {"views": "views", "lidar": "sectors", "motion": "motion"}
-        return {field: np.zeros((self.worlds, self.drones, *shapes[key]), np.float32) for key, field in names.items()}
+        return {name: np.zeros((*size, *shape), np.float32) for name, shape in self.settings.observation.shapes.items()}
 
     @property
     def alive(self) -> NDArray[np.bool_]:
@@ -181,7 +164,7 @@ class Exploration:
         """
         self._check(actions)
         self.decisions.decide(np.asarray(actions, np.float32), self.estimates)
-        self._turn = 1 - self._turn
+        self._now = 1 - self._now
         reward = np.zeros((self.worlds, self.drones), np.float32)
         running = np.ones(self.worlds, bool)
         ticks = self.settings.action.decision_ticks
@@ -207,12 +190,12 @@ class Exploration:
                 f"at ({x:.2f}, {y:.2f}), is not finite"
             )
 
-    def _tick(self, running: NDArray[np.bool_], observe: bool) -> NDArray[np.float32]:
+    def _tick(self, running: NDArray[np.bool_], observes: bool) -> NDArray[np.float32]:
         """Fly one tick in the `running` worlds, clear the flag of those that end with it, return what was earned."""
         touched = self.twin.contacts.copy()
         flying = self.alive & running[:, None]
         self.ticks += running
-        self._run(np.where(running, FLYING, WAITING), observe)
+        self._run(np.where(running, FLYING, WAITING), observes)
         gained = np.where(running[:, None], self.maps.arrays.gained, 0)
         begun = self.twin.contacts - touched
         coverage = self.maps.coverage()
@@ -227,32 +210,64 @@ class Exploration:
         running &= ~over
         return earned
 
-    def _run(self, modes: NDArray[np.int64], observe: bool = True) -> None:
+    def _run(self, modes: NDArray[np.int64], observes: bool = True) -> None:
         """Run a tick in all worlds, as `modes` says for each."""
-        twin, batch = self.twin, self._batches[self._turn]
-        batch.modes[...] = modes
-        twin.workers.over(
-            self.worlds, tick_worlds, observe, batch, self._specs, twin.sensors(self._sight_m), twin.kernel_args(),
-            twin.mover_discs, twin.mover_edges, twin.limits.radius_m, scratch=self.maps.scratch,
-        )  # fmt: skip
+        twin = self.twin
+        sensors, flight = twin.sensors(self._sight_m), twin.kernel_args()
+        levels = sensors.levels, sensors.rows
+        seen = self._observed[self._now]
+        maps, air = self.maps.arrays, self.air.state
+
+        def run_part(first: int, last: int, scratch: Scratch) -> None:
+            lap = self._lap()
+            fly(
+                first, last, modes, self.decisions.intents, self._setpoints, self.ranges, self.estimates, twin.alive,
+                self._specs, flight,
+            )  # fmt: skip
+            lap("fly")
+            scan(
+                first, last, modes, self._turns, self.ranges, sensors, twin.poses, twin.velocity, twin.alive,
+                twin.mover_discs, twin.mover_edges, twin.limits.radius_m,
+            )  # fmt: skip
+            lap("scan")
+            share(
+                first, last, modes, self.ticks, self._keys, twin.poses, twin.velocity, self.estimates, twin.alive,
+                self.ranges, maps, self.maps.pens, air, levels, scratch,
+            )  # fmt: skip
+            lap("share")
+            derive(first, last, maps, scratch)
+            lap("derive")
+            if observes:
+                observe(
+                    first, last, modes, seen["views"], seen["lidar"], seen["motion"], maps.belief, maps.cost,
+                    maps.origins, self.estimates, twin.velocity, self.ranges, self._specs,
+                )  # fmt: skip
+                lap("observe")
+
+        twin.workers.over(self.worlds, run_part, scratch=self.maps.scratch)
         twin.ticks += 1
         active = modes != WAITING
         self.decisions.sense(self.estimates, self.links(), self.maps.origins, self.alive, active, self.dt)
-        if observe:
-            self.decisions.fill(batch.views, batch.motion, self.estimates, self.maps.origins)
+        if observes:
+            self.decisions.fill(seen["views"], seen["motion"], self.estimates, self.maps.origins)
 
     def time_stages(self) -> None:
-        """Begin to add up how long each stage of a tick takes, see `stage_seconds`."""
-        address = ctypes.cast(ctypes.CDLL(None).clock_gettime, ctypes.c_void_p).value
-        for scratch in self.maps.scratch:
-            scratch.clock[0] = address or 0
-            scratch.nanoseconds[:] = 0
+        """Begin to add up the processor time that each stage of a tick takes, see `stage_seconds`."""
+        self.stage_seconds = dict.fromkeys(STAGES, 0.0)
 
-    @property
-    def stage_seconds(self) -> dict[str, float]:
-        """How long each stage of a tick took since `time_stages`, summed over threads; 0 without that call."""
-        total = np.sum([scratch.nanoseconds for scratch in self.maps.scratch], axis=0)
-        return {name: float(total[stage]) * 1e-9 for stage, name in enumerate(STAGE_NAMES)}
+    def _lap(self) -> Callable[[str], None]:
+        """Return what adds this thread's processor time since it was last called to a stage."""
+        if not self.stage_seconds:
+            return lambda _: None
+        before = time.thread_time()
+
+        def add(stage: str) -> None:
+            nonlocal before
+            now = time.thread_time()
+            self.stage_seconds[stage] += now - before
+            before = now
+
+        return add
 
     def links(self) -> NDArray[np.bool_]:
         """Tell who exchanges maps with whom now, bool `[worlds, drones, drones]`; nobody under the protocol `off`."""
@@ -278,8 +293,7 @@ class Exploration:
         return self._recorder.finish(world, totals)
 
     def _observation(self) -> Observation:
-        batch = self._batches[self._turn]
-        return Observation({"views": batch.views, "lidar": batch.sectors, "motion": batch.motion}, self)
+        return Observation(self._observed[self._now], self)
 
     def critic_images(self) -> NDArray[np.float32]:
         """Return what a centralised critic sees of every drone's world, float32 `[worlds, drones, channels, n, n]`."""

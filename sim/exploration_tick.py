@@ -1,8 +1,8 @@
-"""One tick of exploration, compiled: all that happens in a world between a decision and the next observation.
+"""The stages of a tick of exploration, compiled: what happens in a world between a decision and the next observation.
 
-The stages run in the order of a runner's tick on board: fly, scan, hear the peers, map, derive belief and frontier
-field, observe, speak. A world runs through all of them before the next one begins, so that what one stage writes is
-still in the cache when the next one reads it; and no world looks at another, so threads may share worlds out.
+In the order of a runner's tick on board: fly, scan, share (hear the peers, map, speak), derive belief and frontier
+field, observe. Each stage is one kernel over worlds `first` to `last`; `modes` `[worlds]` says what a world does. No
+world looks at another, so threads may share worlds out.
 """
 
 from __future__ import annotations
@@ -16,19 +16,15 @@ from numpy.typing import NDArray
 from imagine.core.action import Parameters, body_velocity_kernel
 from imagine.core.observation import MOTION, fill_motion, fill_sectors, fill_views
 from imagine.core.shield import shield_kernel
-from imagine.sim.air import AirState
 from imagine.sim.air_receive import deliver, peer_place
 from imagine.sim.air_send import send
-from imagine.sim.chipmunk import call_address
 from imagine.sim.physics import step_worlds
 from imagine.sim.scan_world import scan_world
-from imagine.sim.team_maps import MapArrays, Pens, derive, integrate_scans
+from imagine.sim.team_maps import integrate_scans
 
 WAITING, FLYING, LAUNCHING = 0, 1, 2
 """What a world does in a tick: nothing, all stages, or all but flying, for what is seen at the launch."""
-PHYSICS, RAYS, HEARING, MAPPING, DERIVING, OBSERVING, SPEAKING = range(7)
-STAGE_NAMES = ("physics", "rays", "radio in", "integration", "belief and field", "views", "radio out")
-_CLOCK_MONOTONIC = 3  # of Linux's <time.h>
+STAGES = ("fly", "scan", "share", "derive", "observe")
 
 
 class Specs(NamedTuple):
@@ -47,147 +43,92 @@ class Specs(NamedTuple):
     heading_axes: bool
 
 
-class Batch(NamedTuple):
-    """The arrays of all worlds that a tick works on, `[worlds, drones, ...]`.
+@numba.njit(cache=True, nogil=True)
+def fly(first, last, modes, intents, setpoints, ranges, estimates, alive, specs, flight):  # type: ignore[no-untyped-def]
+    """Turn the intents that stand into setpoints, shielded by the newest scan as in flight, and fly a tick.
 
-    `modes` and `ticks` `[worlds]`; `poses` and `velocity` are the truth, `estimates` what drones take their poses to
-    be; `places` float64 `[worlds, drones, drones, 2]` where each takes its peers to be, nan where it does not know.
+    `intents` and `setpoints` float64 `[worlds, drones, 3]`, `estimates` the poses that drones take theirs to be,
+    `flight` is `Twin.kernel_args()`. The dead get no setpoint.
     """
-
-    modes: NDArray[np.int64]
-    ticks: NDArray[np.int64]
-    scans: NDArray[np.int64]
-    keys: NDArray[np.uint64]
-    intents: NDArray[np.float64]
-    setpoints: NDArray[np.float64]
-    poses: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    estimates: NDArray[np.float64]
-    alive: NDArray[np.bool_]
-    places: NDArray[np.float64]
-    ranges: NDArray[np.float32]
-    views: NDArray[np.float32]
-    sectors: NDArray[np.float32]
-    motion: NDArray[np.float32]
-    maps: MapArrays
-    pens: Pens
-    air: AirState
-
-
-@numba.njit(cache=True, nogil=True)
-def tick_worlds(first, last, observes, batch, specs, sensors, flight, discs, edges, radius, scratch):  # type: ignore[no-untyped-def]
-    """Run a tick in worlds first to last, each as its mode says; fill observations only where one `observes`.
-
-    `sensors` are `Sensing.sensors()`, `flight` is `Twin.kernel_args()`, `discs` and `edges` what moves; `scratch` is
-    this thread's own.
-    """
-    for world in range(first, last):
-        mode = batch.modes[world]
-        if mode == WAITING:
-            continue
-        began = _lap(scratch, -1, 0)
-        if mode == FLYING:
-            _aim(world, batch, specs)
-            step_worlds(world, world + 1, batch.setpoints, *flight)
-        began = _lap(scratch, PHYSICS, began)
-        batch.scans[world] += 1
-        scan_world(
-            world, batch.ranges, sensors, batch.poses, batch.velocity, batch.alive, discs, edges, radius,
-            batch.scans[world],
-        )  # fmt: skip
-        began = _lap(scratch, RAYS, began)
-        _hear(world, batch, sensors)
-        began = _lap(scratch, HEARING, began)
-        integrate_scans(
-            world, batch.maps, batch.pens, batch.ranges[world], batch.estimates[world], batch.places[world],
-            batch.alive[world], scratch,
-        )  # fmt: skip
-        began = _lap(scratch, MAPPING, began)
-        derive(world, batch.maps, scratch)
-        began = _lap(scratch, DERIVING, began)
-        if observes:
-            _observe(world, batch, specs)
-        began = _lap(scratch, OBSERVING, began)
-        maps = batch.maps
-        send(
-            batch.air, world, batch.ticks[world], batch.estimates[world], batch.velocity[world], batch.alive[world],
-            batch.ranges[world], scratch.marks, scratch.corners, maps.clocks[world], maps.layers[world], maps.versions[world],
-        )  # fmt: skip
-        _lap(scratch, SPEAKING, began)
-
-
-@numba.njit(cache=True, nogil=True)
-def _lap(scratch, stage, began):  # type: ignore[no-untyped-def]
-    """Add the time since `began` (ns) to a stage and return what it is now; do nothing where no clock is set."""
-    if scratch.clock[0] == 0:
-        return 0
-    call_address(scratch.clock[0], (_CLOCK_MONOTONIC, scratch.lap.ctypes.data))
-    now = scratch.lap[0] * 1_000_000_000 + scratch.lap[1]
-    if stage >= 0:
-        scratch.nanoseconds[stage] += now - began
-    return now
-
-
-@numba.njit(cache=True, nogil=True)
-def _aim(world, batch, specs):  # type: ignore[no-untyped-def]
-    """Turn the intents that stand into body setpoints, shielded by the newest scan as in flight; none for the dead."""
     range_min, start, increment = specs.lidar
     radius, lag, acceleration = specs.shield
-    for drone in range(batch.intents.shape[1]):
-        if not batch.alive[world, drone]:
-            batch.setpoints[world, drone, :] = 0.0
+    for world in range(first, last):
+        if modes[world] != FLYING:
             continue
-        intent, pose = batch.intents[world, drone], batch.estimates[world, drone]
-        vx, vy, rate = body_velocity_kernel(
-            intent[0], intent[1], intent[2], specs.parameters, pose[0], pose[1], pose[2]
-        )
-        vx, vy = shield_kernel(
-            vx, vy, batch.ranges[world, drone], range_min, start, increment, radius, lag, acceleration
-        )
-        batch.setpoints[world, drone, 0], batch.setpoints[world, drone, 1] = vx, vy
-        batch.setpoints[world, drone, 2] = rate
+        for drone in range(intents.shape[1]):
+            vx, vy, rate = 0.0, 0.0, 0.0
+            if alive[world, drone]:
+                vx, vy, rate = body_velocity_kernel(
+                    intents[world, drone, 0], intents[world, drone, 1], intents[world, drone, 2], specs.parameters,
+                    estimates[world, drone, 0], estimates[world, drone, 1], estimates[world, drone, 2],
+                )  # fmt: skip
+                vx, vy = shield_kernel(
+                    vx, vy, ranges[world, drone], range_min, start, increment, radius, lag, acceleration
+                )
+            setpoints[world, drone, 0], setpoints[world, drone, 1], setpoints[world, drone, 2] = vx, vy, rate
+        step_worlds(world, world + 1, setpoints, *flight)
 
 
 @numba.njit(cache=True, nogil=True)
-def _hear(world, batch, sensors):  # type: ignore[no-untyped-def]
-    """Let arrive what was sent before, and note where everyone takes the others to be."""
-    maps, levels, row = batch.maps, sensors.levels, sensors.rows[world]
-    walls = levels.edges[row, : levels.shape[row, 2]]
-    deliver(
-        batch.air, world, batch.ticks[world], batch.keys[world], batch.poses[world], batch.alive[world], walls,
-        maps.layers[world],
-        maps.versions[world], maps.dirty[world],
-    )  # fmt: skip
-    drones, peers = batch.poses.shape[1], batch.air.peers[world]
-    for drone in range(drones):
-        for peer in range(drones):
-            place = batch.places[world, drone, peer]
-            place[0], place[1] = np.nan, np.nan
-            if peer != drone:
-                x, y, known = peer_place(peers[drone, peer], batch.ticks[world], batch.air.rules)
-                if known:
-                    place[0], place[1] = x, y
+def scan(first, last, modes, turns, ranges, sensors, poses, velocity, alive, discs, edges, radius):  # type: ignore[no-untyped-def]
+    """Take a turn of every LiDAR, as `scan_world`; `turns` int64 `[worlds]` counts them, and draws their noise."""
+    for world in range(first, last):
+        if modes[world] != WAITING:
+            turns[world] += 1
+            scan_world(world, ranges, sensors, poses, velocity, alive, discs, edges, radius, turns[world])
 
 
 @numba.njit(cache=True, nogil=True)
-def _observe(world, batch, specs):  # type: ignore[no-untyped-def]
-    """Fill what the policies of a world see, as `core.observation` does in flight."""
+def share(first, last, modes, ticks, keys, poses, velocity, estimates, alive, ranges, maps, pens, air, levels, scratch):  # type: ignore[no-untyped-def]
+    """Let arrive what was sent before, map the own scans, and send what there is to say, as a runner does in a tick.
+
+    Peers reach each other by the true `poses`, and map by their `estimates`; `levels` is a pair of the levels' arrays
+    and each world's row of them, `keys` uint64 `[worlds]` draw the losses.
+    """
+    arrays, rows = levels
+    drones = poses.shape[1]
+    places = np.empty((drones, drones, 2))
+    for world in range(first, last):
+        if modes[world] == WAITING:
+            continue
+        row, tick = rows[world], ticks[world]
+        walls = arrays.edges[row, : arrays.shape[row, 2]]
+        deliver(
+            air, world, tick, keys[world], poses[world], alive[world], walls, maps.layers[world], maps.versions[world],
+            maps.dirty[world],
+        )  # fmt: skip
+        for drone in range(drones):
+            for peer in range(drones):
+                x, y, known = peer_place(air.peers[world, drone, peer], tick, air.rules)
+                known = known and peer != drone
+                places[drone, peer, 0], places[drone, peer, 1] = (x, y) if known else (np.nan, np.nan)
+        integrate_scans(world, maps, pens, ranges[world], estimates[world], places, alive[world], scratch)
+        send(
+            air, world, tick, estimates[world], velocity[world], alive[world], ranges[world], scratch.marks,
+            scratch.corners, maps.clocks[world], maps.layers[world], maps.versions[world],
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def observe(first, last, modes, views, sectors, motion, belief, cost, origins, estimates, velocity, ranges, specs):  # type: ignore[no-untyped-def]
+    """Fill what policies see, as `core.observation` does in flight, but for what options add."""
     range_min, start, increment = specs.lidar
-    maps = batch.maps
     channels = 2 * len(specs.scales_m)
-    for drone in range(batch.poses.shape[1]):
-        pose, velocity = batch.estimates[world, drone], batch.velocity[world, drone]
-        turn = pose[2] if specs.heading_axes else 0.0
-        fill_views(
-            batch.views[world, drone, :channels], maps.belief[world, drone], maps.cost[world, drone],
-            maps.origins[world, 0], maps.origins[world, 1], pose[0], pose[1], turn, specs.scales_m,
-            specs.frontier_ranges_m,
-        )  # fmt: skip
-        fill_sectors(
-            batch.sectors[world, drone], batch.ranges[world, drone], range_min, start, increment, pose[2] - turn,
-            specs.lidar_range_m,
-        )  # fmt: skip
-        fill_motion(
-            batch.motion[world, drone, :MOTION], velocity[0], velocity[1], velocity[2], turn, specs.speed_mps,
-            specs.yaw_rate_rps,
-        )  # fmt: skip
+    for world in range(first, last):
+        if modes[world] == WAITING:
+            continue
+        for drone in range(views.shape[1]):
+            x, y, yaw = estimates[world, drone, 0], estimates[world, drone, 1], estimates[world, drone, 2]
+            turn = yaw if specs.heading_axes else 0.0
+            fill_views(
+                views[world, drone, :channels], belief[world, drone], cost[world, drone], origins[world, 0],
+                origins[world, 1], x, y, turn, specs.scales_m, specs.frontier_ranges_m,
+            )  # fmt: skip
+            fill_sectors(
+                sectors[world, drone], ranges[world, drone], range_min, start, increment, yaw - turn,
+                specs.lidar_range_m,
+            )  # fmt: skip
+            fill_motion(
+                motion[world, drone, :MOTION], velocity[world, drone, 0], velocity[world, drone, 1],
+                velocity[world, drone, 2], turn, specs.speed_mps, specs.yaw_rate_rps,
+            )  # fmt: skip

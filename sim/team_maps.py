@@ -27,9 +27,6 @@ from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec
 from imagine.core.raster import LIMIT, TILE, apply_marks, beam_directions, mark_scan, ray_table
 from imagine.sim.workers import Workers
 
-STAGES = 8
-"""How many parts of a tick a thread may time."""
-
 
 class MapArrays(NamedTuple):
     """The maps of all worlds, as kernels take them.
@@ -73,15 +70,11 @@ class Scratch(NamedTuple):
     """What one thread works with, one world after another, so that it stays in the cache.
 
     `marks` int8 `[drones, rows, width]` are the newest scans drawn, `corners` int64 `[drones, 2]` the grid
-    row and column of their first cell. `clock` holds the address of C's clock_gettime, or 0 where nothing is timed;
-    `lap` is what it writes, `nanoseconds` what each stage took.
+    row and column of their first cell.
     """
 
     marks: NDArray[np.int8]
     corners: NDArray[np.int64]
-    clock: NDArray[np.int64]
-    lap: NDArray[np.int64]
-    nanoseconds: NDArray[np.int64]
     dirty: NDArray[np.int32]
     is_dirty: NDArray[np.uint8]
     heads: NDArray[np.int32]
@@ -130,8 +123,7 @@ class TeamMaps:
         cells = padded[0] * padded[1]
         self.scratch = [
             Scratch(
-                np.zeros((drones, *table.sheet), np.int8), np.zeros((drones, 2), np.int64), np.zeros(1, np.int64),
-                np.zeros(2, np.int64), np.zeros(STAGES, np.int64),
+                np.zeros((drones, *table.sheet), np.int8), np.zeros((drones, 2), np.int64),
                 np.empty(cells, np.int32), np.zeros(cells, np.uint8), *search_scratch(cells),
                 np.empty((tiles[0] * tiles[1], 4), np.int64), np.empty(lidar.beams, np.float32),
             )
@@ -231,10 +223,11 @@ def _see(cells, seen, coverable, tile_row, tile_column):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True, nogil=True)
-def derive(world, maps, scratch):  # type: ignore[no-untyped-def]
-    """Bring belief and frontier field of one world's drones up to date where their layers changed."""
-    drones, tile_rows, tile_columns = maps.dirty.shape[1:]
-    for drone in range(drones):
+def derive(first, last, maps, scratch):  # type: ignore[no-untyped-def]
+    """Bring belief and frontier field of all drones of worlds first to last up to date where their layers changed."""
+    _, drones, tile_rows, tile_columns = maps.dirty.shape
+    for index in range(first * drones, last * drones):
+        world, drone = index // drones, index % drones
         dirty, belief, states = maps.dirty[world, drone], maps.belief[world, drone], maps.states[world, drone]
         boxes = 0
         for i in range(tile_rows):
