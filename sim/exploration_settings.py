@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from pydantic import Field, field_validator
 
 from imagine.core.config import Settings
 from imagine.core.contract import ActionSpec
-from imagine.core.lidar import PRESETS
+from imagine.core.lidar import PRESETS, LidarSpec
 from imagine.core.mapping import MapSettings
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.vehicle_limits import VehicleLimits
@@ -26,6 +28,9 @@ class ExplorationSettings(Settings):
     mirror: bool = Field(default=True, description="show levels mirrored and turned as well")
     stagger: bool = Field(default=False, description="give first episodes different lengths, so resets spread out")
     lidar: str = "ld19"
+    lidar_beams: int | None = Field(
+        default=None, ge=4, le=4096, description="the same sensor with so many beams; by default its own"
+    )
     map: MapSettings = MapSettings()
     limits: VehicleLimits = VehicleLimits()
     observation: ObservationSpec = ObservationSpec()
@@ -44,3 +49,9 @@ class ExplorationSettings(Settings):
         if name not in PRESETS:
             raise ValueError(f"unknown LiDAR; known: {', '.join(PRESETS)}")
         return name
+
+    @property
+    def lidar_spec(self) -> LidarSpec:
+        """The sensor that is explored with: the preset, with `lidar_beams` spread over its field of view."""
+        preset = PRESETS[self.lidar]
+        return preset if self.lidar_beams is None else dataclasses.replace(preset, beams=self.lidar_beams)
