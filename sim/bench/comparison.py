@@ -14,72 +14,71 @@ from imagine.sim.plain import PlainExploration
 from imagine.sim.plain.exploration import Variant
 
 PLAIN: tuple[Variant, ...] = ("plain", "plain-scipy", "plain-kernels")
-_TICKS_OF_A_PLAIN_WORLD = 4  # before the next world has its turn
+_TICKS_OF_A_WORLD = 4  # before the next one has its turn
+
+
+class _PlainFlight:
+    """A plain exploration that visits the worlds of a batch, with its stop-watches."""
+
+    def __init__(self, batch: Exploration, variant: Variant, flying: Flying) -> None:
+        self.laps = Laps()
+        self._plain = PlainExploration(batch.settings, 0, 0, variant, time.thread_time)
+        self._plain.reset()  # which works out where the level can be flown in, as the batch has
+        self.stages = StageWatch(self._plain)
+        self._batch, self._flying = batch, flying
+
+    def round(self, order: Sequence[int], budget_s: float, generator: np.random.Generator) -> None:
+        """Fly a few ticks of one world after the other, in this order, until the time is up."""
+        self.laps.start_round()
+        shape = self._plain.drones, self._plain.settings.action.size
+        for world in order:
+            self._plain.take_over(self._batch, world)
+            for tick in range(1 + _TICKS_OF_A_WORLD):
+                if self._flying == "frontier":
+                    actions = self._plain.planner_actions()
+                else:
+                    actions = generator.uniform(-1.0, 1.0, shape).astype(np.float32)
+                if tick == 0:  # in which pymunk sorts the new world's shapes
+                    self._plain.step(actions)
+                    continue
+                with self.stages, self.laps.timed(self._plain.drones):
+                    self._plain.step(actions)
+            if self.laps.wall_s[-1] >= budget_s:
+                return
 
 
 def comparison(plan: BenchPlan, beams: int, flying: Flying, progress: Progress = lambda _: None) -> Results:
     """Measure the batched step and each plain one in turns; the plain ones go on from where worlds of the batch are.
 
-    First episodes have different lengths, so worlds are in all stages of an episode, and some end in every tick.
+    First episodes have different lengths, so worlds are in all stages of an episode, and end one after the other.
     """
     worlds, drones = plan.compared_worlds, plan.compared_drones
-    name = f"{beams}_beams" + ("_random" if flying == "random" else "")
-    progress(f"{worlds} worlds of {drones} drones, {beams} beams, {flying}: flying up to the first measurement")
+    title = f"{worlds} worlds of {drones} drones, {beams} beams, {flying}"
+    progress(f"{title}: flying up to the first measurement")
     batch = make_batch(plan, worlds, drones, beams, stagger=True)
     generator = np.random.default_rng(0)
     for _ in range(plan.episode_ticks if flying == "frontier" else min(plan.random_ticks, plan.episode_ticks)):
         batch.step(choose_actions(batch, flying, generator))
-    plain = {variant: PlainExploration(batch.settings, 0, 0, variant, time.thread_time) for variant in PLAIN}
-    for one in plain.values():
-        one.reset()  # which works out where the level can be flown in, as the batch has
-    laps = {"batched": Laps()} | {variant: Laps() for variant in PLAIN}
+    plain = {variant: _PlainFlight(batch, variant, flying) for variant in PLAIN}
+    laps, stages = Laps(), StageWatch(batch)
     budget_s = plan.seconds / plan.rounds
-    stages = StageWatch(batch)
-    plain_stages = {variant: StageWatch(one) for variant, one in plain.items()}
     for number in range(plan.rounds):
-        progress(f"{worlds} worlds of {drones} drones, {beams} beams, {flying}: round {number + 1} of {plan.rounds}")
+        progress(f"{title}: round {number + 1} of {plan.rounds}")
         order = generator.permutation(worlds).tolist()
-        for variant in PLAIN:
-            laps[variant].start_round()
-            _fly_plain(plain[variant], batch, order, flying, laps[variant], budget_s, generator, plain_stages[variant])
-        laps["batched"].start_round()
-        while laps["batched"].wall_s[-1] < budget_s:
+        for flight in plain.values():
+            flight.round(order, budget_s, generator)
+        laps.start_round()
+        while laps.wall_s[-1] < budget_s:
             actions = choose_actions(batch, flying, generator)
-            with stages, laps["batched"].timed(worlds * drones):
+            with stages, laps.timed(worlds * drones):
                 batch.step(actions)
-    results = {f"{who}_{name}".replace("-", "_"): lap.told() for who, lap in laps.items()}
-    for variant in PLAIN:
-        results[f"batched_over_{variant}_{name}".replace("-", "_")] = ratio(laps["batched"], laps[variant])
-    if flying == "frontier":
-        results |= stages.told("batched", name, sum(laps["batched"].steps))
-        for variant in PLAIN:
-            results |= plain_stages[variant].told(variant, name, sum(laps[variant].steps))
-    return results
 
-
-def _fly_plain(
-    plain: PlainExploration,
-    batch: Exploration,
-    order: Sequence[int],
-    flying: Flying,
-    laps: Laps,
-    budget_s: float,
-    generator: np.random.Generator,
-    stages: StageWatch,
-) -> None:
-    """Fly a few ticks of one world after the other, until the time is up."""
-    shape = plain.drones, plain.settings.action.size
-    for world in order:
-        plain.take_over(batch, world)
-        for tick in range(1 + _TICKS_OF_A_PLAIN_WORLD):
-            if flying == "frontier":
-                actions = plain.planner_actions()
-            else:
-                actions = generator.uniform(-1.0, 1.0, shape).astype(np.float32)
-            if tick == 0:  # in which pymunk sorts the new world's shapes
-                plain.step(actions)
-                continue
-            with stages, laps.timed(plain.drones):
-                plain.step(actions)
-        if laps.wall_s[-1] >= budget_s:
-            return
+    name = f"{beams}_beams" + ("_random" if flying == "random" else "")
+    results = {f"batched_{name}": laps.told()}
+    for variant, flight in plain.items():
+        who = variant.replace("-", "_")
+        results[f"{who}_{name}"] = flight.laps.told()
+        results[f"batched_over_{who}_{name}"] = ratio(laps, flight.laps)
+        if flying == "frontier":
+            results |= flight.stages.told(who, name, sum(flight.laps.steps))
+    return results | (stages.told("batched", name, sum(laps.steps)) if flying == "frontier" else {})

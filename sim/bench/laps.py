@@ -83,7 +83,7 @@ class StageWatch:
         """Return each stage's time an agent-step, and its share of the whole."""
         total = sum(self._seconds.values()) or 1.0
         return {
-            f"{who.replace('-', '_')}_stage_{stage}_{name}": {
+            f"{who}_stage_{stage}_{name}": {
                 "value": 1e6 * seconds / max(1, steps), "unit": "us/agent-step", "share": seconds / total,
             }
             for stage, seconds in self._seconds.items()
