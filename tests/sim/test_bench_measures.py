@@ -18,7 +18,8 @@ from imagine.sim.exploration import Observation
 
 SMALL = BenchPlan(
     level="0", beams=(360,), worlds=(1, 2, 8), drones=(1, 4), seconds=0.1, rounds=2,
-    compared_worlds=4, compared_drones=2, worlds_for_drones=2, episode_ticks=20, random_ticks=3, growth_ticks=2, copies=1,
+    compared_worlds=4, compared_drones=2, worlds_for_drones=2,
+    episode_ticks=20, random_ticks=3, growth_ticks=2, copies=1,
 )  # fmt: skip
 
 
