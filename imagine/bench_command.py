@@ -110,24 +110,25 @@ def growth_table(plan: BenchPlan, what: str, results: Results) -> Table:
     table = _table(f"Growth with {what}, {plan.beams[0]} beams: agent-steps/s")
     for title in ("worlds", "drones", "ms a tick", "per second", "per CPU s", "kB arrays a drone"):
         table.add_column(title, justify="right")
-    table.add_column("kB resident a drone", justify="right")
+    if what == "worlds":
+        table.add_column("kB resident a drone", justify="right")
+    notes = []
     for size in plan.worlds if what == "worlds" else plan.drones:
         row = results[f"{what}_{size}"]
         if row["value"] is None:
-            table.add_row(str(row["worlds"]), str(row["drones"]), f"left out: {row['skipped']}")
+            table.add_row(str(row["worlds"]), str(row["drones"]), "–")
+            notes.append(f"{row['worlds']} worlds of {row['drones']} drones left out: {row['skipped']}")
             continue
         table.add_row(
             str(row["worlds"]), str(row["drones"]), f"{1e3 * row['tick_s']:.3g}", f"{row['value']:,.0f}",
             f"{row['per_cpu_s']:,.0f}", f"{row['array_bytes_a_drone'] / 1e3:,.0f}",
-            f"{row['resident_bytes_a_drone'] / 1e3:,.0f}",
+            *([f"{row['resident_bytes_a_drone'] / 1e3:,.0f}"] if what == "worlds" else []),
         )  # fmt: skip
-    powers = [f"{name} grows as {what}^{results[key]['value']:.2f}" for name, key in _powers(what) if key in results]
-    table.caption = ", ".join(powers)
+    for name in ("time", "memory"):
+        if (power := results.get(f"{name}_growth_{what}")) is not None:
+            notes.append(f"{'CPU time' if name == 'time' else name} grows as {what}^{power['value']:.2f}")
+    table.caption = "\n".join(notes)
     return table
-
-
-def _powers(what: str) -> list[tuple[str, str]]:
-    return [("time", f"time_growth_{what}"), ("memory", f"memory_growth_{what}")]
 
 
 def stage_table(plan: BenchPlan, results: Results) -> Table | None:
@@ -140,7 +141,7 @@ def stage_table(plan: BenchPlan, results: Results) -> Table | None:
     table = _table("Where the time goes, µs an agent-step")
     table.add_column("stage")
     for who, beams in found:
-        table.add_column(f"{who.replace('_', '-')}\n{beams} beams", justify="right")
+        table.add_column("\n".join([*who.split("_"), f"{beams} beams"]), justify="right", vertical="bottom")
     for name in dict.fromkeys(name for stages in found.values() for name in stages):
         table.add_row(name, *(f"{stages[name]:,.1f}" if name in stages else "" for stages in found.values()))
     return table

@@ -37,7 +37,9 @@ def plot_growth(path: Path, plan: BenchPlan, results: Results) -> None:
     ticks_ms = [1e3 * row["tick_cpu_s"] for row in by_worlds]
     _curve(time_worlds, plan.worlds, [row["worlds"] for row in by_worlds], ticks_ms, _BATCHED, "batched")
     for who, style in (("plain", "-"), ("plain_kernels", "--")):
-        rate = results[f"{who}_{plan.beams[0]}_beams"]["per_cpu_s"]
+        if not by_worlds:
+            break
+        rate = results[f"worlds_{who}"]["per_cpu_s"]
         plain_ms = [1e3 * row["worlds"] * row["drones"] / rate for row in by_worlds]
         time_worlds.plot(
             [row["worlds"] for row in by_worlds], plain_ms, style, color=_PLAIN, lw=1.4,
@@ -72,7 +74,12 @@ def _curve(axes: Axes, ticks: tuple[int, ...], x: list[Any], y: list[float], col
         axes.plot(x, y, "o-", color=colour, lw=2.0, ms=5.5, label=label)
         for size, value in zip(x, y, strict=True):
             axes.annotate(
-                f"{value:.3g}", (size, value), textcoords="offset points", xytext=(5, -11), fontsize=8, color=colour
+                f"{value:.3g}" if value < 1000.0 else f"{value:,.0f}",
+                (size, value),
+                textcoords="offset points",
+                xytext=(5, -11),
+                fontsize=8,
+                color=colour,
             )
 
 

@@ -11,9 +11,11 @@ import numpy as np
 
 from imagine.sim.bench.laps import Laps
 from imagine.sim.bench.memory import array_bytes, free_bytes, resident_bytes
+from imagine.sim.bench.plain_flight import PLAIN, PlainFlight
 from imagine.sim.bench.plan import BenchPlan, Progress, Results, choose_actions, make_batch
 from imagine.sim.exploration import Exploration
 from imagine.sim.level import load_level
+from imagine.sim.plain.exploration import Variant
 
 _TICKS_A_ROUND = 3
 _MEMORY_SHARE = 0.5  # of what is free
@@ -65,6 +67,7 @@ def growth(plan: BenchPlan, what: Literal["worlds", "drones"], progress: Progres
     for size in sizes:
         bytes_of_one = _launch(plan, size, bytes_of_one, generator, progress)
     flying = [size for size in sizes if not size.skipped]
+    plain = _plain_beside(plan, flying) if what == "worlds" else {}
     for number in range(plan.rounds):
         progress(f"growth over {what}: round {number + 1} of {plan.rounds}")
         for size in flying:
@@ -73,8 +76,18 @@ def growth(plan: BenchPlan, what: Literal["worlds", "drones"], progress: Progres
                 actions = choose_actions(batch, "frontier", generator)
                 with size.laps.timed(size.worlds * size.drones):
                     batch.step(actions)
+        for flight in plain.values():
+            order = generator.permutation(flight.worlds).tolist()
+            flight.round(order, plan.seconds / plan.rounds / 2.0, generator)
     rows = {size.name: size.told() for size in sizes}
-    return rows | _exponents(what, [row for row in rows.values() if row["value"] is not None])
+    beside = {f"worlds_{variant.replace('-', '_')}": flight.laps.told() for variant, flight in plain.items()}
+    return rows | beside | _exponents(what, [row for row in rows.values() if row["value"] is not None])
+
+
+def _plain_beside(plan: BenchPlan, flying: list[_Size]) -> dict[Variant, PlainFlight]:
+    """Return plain flights in the worlds of a batch that grows: what they take, they take for every world alike."""
+    some = [size for size in flying if size.worlds <= plan.compared_worlds] or flying
+    return {variant: PlainFlight(some[-1].batches[0], variant, "frontier") for variant in PLAIN if some}
 
 
 def _launch(

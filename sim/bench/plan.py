@@ -33,9 +33,9 @@ class BenchPlan:
     compared_drones: int = 3
     worlds_for_drones: int = 16
     episode_ticks: int = 400
-    random_ticks: int = 100
+    random_ticks: int = 60
     """How long drones at random have flown when they are measured."""
-    growth_ticks: int = 20
+    growth_ticks: int = 12
     """How long those of all sizes have flown when they are measured."""
     memory_limit_bytes: float | None = None
     """No batch may take more; by default half of what is free."""

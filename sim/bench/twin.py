@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from imagine.sim.bench.comparison import PLAIN, comparison
+from imagine.sim.bench.comparison import comparison
 from imagine.sim.bench.growth import growth
+from imagine.sim.bench.plain_flight import PLAIN
 from imagine.sim.bench.plan import BenchPlan, Flying, Progress, Results, choose_actions, make_batch
 from imagine.sim.plain import PlainExploration
 
