@@ -68,7 +68,7 @@ def _curve(axes: Axes, ticks: tuple[int, ...], x: list[Any], y: list[float], col
     axes.set_xscale("log", base=2)
     axes.set_yscale("log")
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
-    axes.minorticks_off()
+    axes.tick_params(axis="x", which="minor", bottom=False)
     if x:
         axes.plot(x, [y[-1] * size / x[-1] for size in x], ":", color=_GUIDE, lw=1.4, label="in proportion")
         axes.plot(x, y, "o-", color=colour, lw=2.0, ms=5.5, label=label)
