@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 import imagine.train  # noqa: F401  sets up OpenMP before torch works
 from imagine.core.contract import CONTRACT_KEY, LidarContract, PolicyContract
 from imagine.core.errors import InputError, WorkError
-from imagine.core.lidar import PRESETS
 from imagine.core.observation_spec import ObservationSpec
 from imagine.onboard.onnx_weights import hash_weights
 from imagine.onboard.policy import OUTPUT, OnnxPolicy
@@ -125,7 +124,7 @@ def parity(actor: Actor, model: bytes, spec: ObservationSpec, observations: int 
 
 def _contract(saved: Checkpoint, name: str, record: dict[str, Any], weights_sha256: str) -> PolicyContract:
     env = saved.settings.env
-    lidar = PRESETS[env.lidar]
+    lidar = env.lidar_spec
     return PolicyContract(
         name=name,
         observation=env.observation,

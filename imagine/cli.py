@@ -41,6 +41,8 @@ level_app = typer.Typer(
     help="Look at levels, check them, and generate houses.", no_args_is_help=True, rich_markup_mode=None
 )
 app.add_typer(level_app, name="level")
+bench_app = typer.Typer(help="Measure how fast things are here.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(bench_app, name="bench")
 
 _SIM_FLAGS = {"level", "drones", "ticks", "speed", "headless", "seed", "port", "map_file", "lockstep"}
 _DRONE_FLAGS = {"vehicle", "lidar", "mesh", "config", "overrides"}
@@ -317,6 +319,26 @@ def level_generate(
     from imagine.level_command import generate_levels
 
     generate_levels(seed, area, count, people, crates, out, image, json_file)
+
+
+@bench_app.command("twin")
+def bench_twin(
+    level: Annotated[str, typer.Option(help="a level, 0 to 6, or a YAML file")] = "6",
+    beams: Annotated[str, typer.Option(help="LiDAR beams to compare at; growth is measured at the first")] = "64,360",
+    worlds: Annotated[str | None, typer.Option(help="how many, for growth; by default 1,4,16,64,256,1024")] = None,
+    drones: Annotated[str | None, typer.Option(help="how many, for growth; by default 1,2,3,4,8,16")] = None,
+    seconds: Annotated[float | None, typer.Option(help="for each thing compared, 0.05 to 600; by default 3")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="small and rough, in seconds")] = False,
+    json_file: JsonFile = None,
+    plot_file: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE.png", help="draw here how the cost grows")
+    ] = None,
+) -> None:
+    """Measure batched exploration in the twin against a plain implementation, and how its cost grows."""
+    check_outputs(json_file)
+    from imagine.bench_command import bench_twin_and_show
+
+    bench_twin_and_show(level, beams, worlds, drones, seconds, quick, json_file, plot_file)
 
 
 @app.command()

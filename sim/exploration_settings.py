@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from pydantic import Field, field_validator
 
 from imagine.core.config import Settings
@@ -30,6 +32,9 @@ class ExplorationSettings(Settings):
     mirror: bool = Field(default=True, description="show levels mirrored and turned as well")
     stagger: bool = Field(default=False, description="give first episodes different lengths, so resets spread out")
     lidar: str = "ld19"
+    lidar_beams: int | None = Field(
+        default=None, ge=4, le=4096, description="the same sensor with so many beams; by default its own"
+    )
     map: MapSettings = MapSettings()
     limits: VehicleLimits = VehicleLimits()
     observation: ObservationSpec = ObservationSpec()
@@ -49,8 +54,9 @@ class ExplorationSettings(Settings):
 
     @property
     def lidar_spec(self) -> LidarSpec:
-        """The sensor that `lidar` names."""
-        return PRESETS[self.lidar]
+        """The sensor that is explored with: the preset, with `lidar_beams` spread over its field of view."""
+        preset = PRESETS[self.lidar]
+        return preset if self.lidar_beams is None else dataclasses.replace(preset, beams=self.lidar_beams)
 
     @property
     def mesh(self) -> MeshSettings:

@@ -1,0 +1,96 @@
+"""Scans into an int8 log-odds layer with numpy: the definition is that of `core.raster.integrate_scan`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec
+from imagine.core.raster import CELL, HIT, LIMIT, MISS, TILE
+
+Cells = NDArray[np.int64]
+
+
+def without_teammates(
+    ranges: NDArray[np.float32], bearings: NDArray[np.float64], offsets: NDArray[np.float64], range_cap_m: float
+) -> NDArray[np.float64]:
+    """Return the ranges `[beams]` as float64, with returns on teammates made invalid (nan).
+
+    `bearings` are the beams' directions in the map frame, `offsets` `[n, 2]` the teammates' positions less the drone's.
+    """
+    kept = ranges.astype(np.float64)
+    for dx, dy in offsets:
+        if dx * dx + dy * dy > (range_cap_m + TEAMMATE_RADIUS_M) ** 2:
+            continue
+        with np.errstate(invalid="ignore"):  # no return is infinitely far away
+            ex, ey = kept * np.cos(bearings) - dx, kept * np.sin(bearings) - dy
+            kept[ex * ex + ey * ey < TEAMMATE_RADIUS_M**2] = np.nan
+    return kept
+
+
+def line_cells(row: int, column: int, end_rows: Cells, end_columns: Cells) -> tuple[Cells, Cells]:
+    """Return the cells of Bresenham lines from one cell to many ends, the ends left out, as rows and columns.
+
+    All lines advance together, a cell a turn; cells that lie on several lines come several times.
+    """
+    d_row, d_column = np.abs(end_rows - row), np.abs(end_columns - column)
+    step_row, step_column = np.sign(end_rows - row), np.sign(end_columns - column)
+    rows, columns = np.full_like(end_rows, row), np.full_like(end_columns, column)
+    error = d_column - d_row
+    passed_rows, passed_columns = [rows[:0]], [columns[:0]]
+    while len(rows):
+        going = (rows != end_rows) | (columns != end_columns)
+        if not going.all():
+            d_row, d_column, step_row, step_column = (a[going] for a in (d_row, d_column, step_row, step_column))
+            rows, columns, error = rows[going], columns[going], error[going]
+            end_rows, end_columns = end_rows[going], end_columns[going]
+        passed_rows.append(rows)
+        passed_columns.append(columns)
+        doubled = 2 * error
+        along, across = doubled > -d_row, doubled < d_column
+        error = error - np.where(along, d_row, 0) + np.where(across, d_column, 0)
+        columns = columns + np.where(along, step_column, 0)
+        rows = rows + np.where(across, step_row, 0)
+    return np.concatenate(passed_rows), np.concatenate(passed_columns)
+
+
+def integrate_scan(
+    cells: NDArray[np.int8],
+    origin: tuple[int, int],
+    pose: tuple[float, float, float],
+    ranges: NDArray[np.float64],
+    lidar: LidarSpec,
+    range_cap_m: float,
+) -> NDArray[np.bool_]:
+    """Add one scan's evidence to `cells` (int8 `[rows, columns]`, first cell at `origin` (column, row)), in place.
+
+    Each cell takes one update at most, a hit before a miss. Returns which tiles changed, bool
+    `[rows // TILE, columns // TILE]`.
+    """
+    x, y, yaw = pose
+    rows, columns = cells.shape
+    usable = ranges >= lidar.range_min  # neither nan nor too close to be trusted
+    lengths = np.minimum(ranges[usable], range_cap_m)
+    bearings = yaw + lidar.bearings[usable]
+    end_columns = np.floor((x + lengths * np.cos(bearings)) / CELL).astype(np.int64) - origin[0]
+    end_rows = np.floor((y + lengths * np.sin(bearings)) / CELL).astype(np.int64) - origin[1]
+    own_column, own_row = math.floor(x / CELL) - origin[0], math.floor(y / CELL) - origin[1]
+    free_rows, free_columns = line_cells(own_row, own_column, end_rows, end_columns)
+
+    hit = ranges[usable] <= range_cap_m
+    evidence = np.zeros(cells.shape, np.int8)
+    for at_rows, at_columns, value in (
+        (free_rows, free_columns, MISS),
+        (end_rows[hit], end_columns[hit], HIT),  # after the misses: a hit wins
+    ):
+        inside = (at_rows >= 0) & (at_rows < rows) & (at_columns >= 0) & (at_columns < columns)
+        evidence[at_rows[inside], at_columns[inside]] = value
+    updated = np.clip(cells + evidence, -LIMIT, LIMIT)
+    changed = updated != cells
+    cells[...] = updated
+    touched = np.zeros((rows // TILE, columns // TILE), np.bool_)
+    changed_rows, changed_columns = np.nonzero(changed)
+    touched[changed_rows // TILE, changed_columns // TILE] = True
+    return touched
