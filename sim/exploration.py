@@ -136,6 +136,7 @@ class Exploration:
 
     def reset(self) -> Observation:
         """Start a new episode in every world."""
+        self._now = 1 - self._now
         for world in range(self.worlds):
             self._restart(world)
             if self.settings.stagger:
