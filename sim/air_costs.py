@@ -116,12 +116,17 @@ def packed_versions_bytes(tiles):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def scan_bytes(ranges, range_min, range_cap, clock):  # type: ignore[no-untyped-def]
-    """Estimate the sealed bytes of a scan message with these ranges and this map clock; it always fits a datagram."""
+def packed_ranges_bytes(ranges, range_min, range_cap):  # type: ignore[no-untyped-def]
+    """Estimate the bytes of `codec.pack_ranges`."""
     differing, far, jumps = scan_features(ranges, range_min, range_cap)
     base, per_differing, per_far, per_jump = SCAN_WEIGHTS
-    packed = base + per_differing * differing + per_far * far + per_jump * jumps
-    return min(_SCAN_BYTES + int_bytes(clock) + blob_bytes(int(packed + 0.5)), MAX_DATAGRAM)
+    return int(base + per_differing * differing + per_far * far + per_jump * jumps + 0.5)
+
+
+@numba.njit(cache=True, nogil=True)
+def scan_message_bytes(packed, clock):  # type: ignore[no-untyped-def]
+    """Return the sealed bytes of a scan with so many bytes of packed ranges; beams are thinned until it fits."""
+    return min(_SCAN_BYTES + int_bytes(clock) + blob_bytes(packed), MAX_DATAGRAM)
 
 
 @numba.njit(cache=True, nogil=True)

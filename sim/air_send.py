@@ -25,15 +25,16 @@ from imagine.sim.air import (
 )
 from imagine.sim.air_costs import (
     digest_message_bytes,
+    packed_ranges_bytes,
     packed_tile_bytes,
     packed_versions_bytes,
-    scan_bytes,
+    scan_message_bytes,
     status_bytes,
     tile_in_message_bytes,
     tiles_message_bytes,
 )
 from imagine.sim.air_receive import is_live
-from imagine.sim.air_tiles import align_marks, copy_tile
+from imagine.sim.air_tiles import copy_tile, erase, find_spans
 
 # these are those of mesh_comm.node, tile_exchange and digest
 _PLAN_PERIOD_S = 0.2
@@ -49,14 +50,36 @@ _ROWS, _PLACES, _SOURCES, _STALE, _MISSING = 1 << 12, 1 << 24, 1 << 6, 1 << 24, 
 
 
 @numba.njit(cache=True, nogil=True)
-def send(air, world, tick, poses, velocity, ranges, marks, mark_corner, clocks, layers, versions):  # type: ignore[no-untyped-def]
+def canvas(air, world, drone, row, column):  # type: ignore[no-untyped-def]
+    """Return (slot, first row, first column): where the next scan of `drone`, in cell (row, column), is to be drawn.
+
+    The marks are `air.marks[world, drone, slot]` (int8 `[side, side or more]`), emptied: -1 for a miss, +2 for a hit,
+    0 untouched. Their first cell is (first row, first column) of the grid; both may lie off it, and so may cells. With
+    `side` = 2 n + 1, n the range cap in cells, rounded up, plus 1, the drone's cell is in the middle row, and the
+    columns reach n to both sides. `send` takes the marks from there; what is drawn is kept until it has arrived.
+    """
+    node = air.nodes[world, drone]
+    taken = node.busy_slots
+    if node.pending_slot >= 0:
+        taken |= 1 << node.pending_slot
+    slot = 0
+    while (taken >> slot) & 1 == 1:
+        slot += 1
+    node.canvas = slot
+    marks, window = air.marks[world, drone, slot], air.windows[world, drone, slot]
+    erase(marks)
+    reach = marks.shape[0] // 2
+    window.row, window.column = row - reach, (column - reach) // TILE * TILE
+    return slot, window.row, window.column
+
+
+@numba.njit(cache=True, nogil=True)
+def send(air, world, tick, poses, velocity, ranges, clocks, layers, versions):  # type: ignore[no-untyped-def]
     """Let every drone of `world` say at `tick` what it has to say; call it when own scans have been integrated.
 
     `poses` `[drones, 3]` and `velocity` `[drones, 2 or more]` in the map frame; `ranges` float32 `[drones, beams]` as
-    they were mapped; `marks` int8 `[drones, side, side]` the evidence of each drone's scan around its cell, the first
-    of it at `mark_corner` (`[drones, 2]`: row and column of the grid, negative where it starts outside), with `side`
-    twice the range cap in cells, rounded up, plus 3; `clocks` `[drones]` the own layers' clocks. `layers` and
-    `versions` as in `deliver`.
+    they were mapped, their marks drawn on each drone's `canvas`; `clocks` `[drones]` the own layers' clocks. `layers`
+    and `versions` as in `deliver`.
     """
     rules = air.rules
     now = tick / rules.ticks_per_s
@@ -69,14 +92,17 @@ def send(air, world, tick, poses, velocity, ranges, marks, mark_corner, clocks, 
             if is_live(peers[drone, peer], tick, rules):
                 live |= 1 << peer
         shares = live != 0 and rules.shares
-        can_offer = shares and now >= node.next_scan - _EPSILON_S and node.scans < air.windows.shape[2]
-        if can_offer and np.int64(clocks[drone]) != node.scan_clock:
-            slot = (node.first_scan + node.scans) % air.windows.shape[2]
-            _keep_scan(
-                node, air.windows[world, drone, slot], air.marks[world, drone, slot], poses[drone], marks[drone],
-                mark_corner[drone], clocks[drone],
-            )  # fmt: skip
-            node.pending_bytes = scan_bytes(ranges[drone], rules.range_min, rules.range_cap, node.pending_clock)
+        can_offer = node.canvas >= 0 and now >= node.next_scan - _EPSILON_S and node.scans < air.windows.shape[2] - 1
+        if shares and can_offer and np.int64(clocks[drone]) != node.scan_clock:
+            # it replaces one that still waits; a slot stays free for the next canvas
+            node.pending_slot, node.pending_clock = node.canvas, np.int64(clocks[drone])
+            packed = packed_ranges_bytes(ranges[drone], rules.range_min, rules.range_cap)
+            node.pending_bytes = scan_message_bytes(packed, node.pending_clock)
+            window = air.windows[world, drone, node.pending_slot]
+            window.clock = node.pending_clock
+            window.x, window.y, window.yaw = poses[drone, 0], poses[drone, 1], poses[drone, 2]
+            find_spans(air.marks[world, drone, node.pending_slot], air.spans[world, drone, node.pending_slot])
+        node.canvas = -1
         if shares and now >= node.next_digest - _EPSILON_S:
             node.next_digest = now + rules.digest_period
             node.digest_units = layers.shape[1] * _units(versions.shape[2] * versions.shape[3])
@@ -203,16 +229,6 @@ def _send_digests(rules, now, drone, node, messages, counters, digests, versions
 
 
 @numba.njit(cache=True, nogil=True)
-def _keep_scan(node, window, aligned, pose, marks, mark_corner, clock):  # type: ignore[no-untyped-def]
-    """Keep the marks of a scan that changed the map, for sending; it replaces one that still waits."""
-    window.row, window.column = mark_corner[0], mark_corner[1] // TILE * TILE
-    window.middle = mark_corner[1] + marks.shape[1] // 2
-    window.x, window.y, window.yaw = pose[0], pose[1], pose[2]
-    window.clock = node.pending_clock = np.int64(clock)
-    align_marks(marks, aligned, mark_corner[1] - window.column)
-
-
-@numba.njit(cache=True, nogil=True)
 def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[no-untyped-def]
     """Send the scan that waits, if any; False when bytes run short."""
     if node.pending_clock == 0:
@@ -221,10 +237,11 @@ def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[n
         return False
     place = _transmit(rules, now, node, messages, counters, SCAN, node.pending_bytes)
     if place >= 0:
-        window = windows[(node.first_scan + node.scans) % windows.shape[0]]
-        messages[place].x, messages[place].y, messages[place].yaw = window.x, window.y, window.yaw
+        message, window = messages[place], windows[node.pending_slot]
+        message.x, message.y, message.yaw, message.slot = window.x, window.y, window.yaw, node.pending_slot
+        node.busy_slots |= 1 << node.pending_slot
         node.scans += 1
-    node.scan_clock, node.pending_clock = node.pending_clock, 0
+    node.scan_clock, node.pending_clock, node.pending_slot = node.pending_clock, 0, -1
     node.next_scan = now + rules.scan_period
     return True
 
