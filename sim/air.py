@@ -47,8 +47,8 @@ def _record(**fields: type) -> np.dtype[np.void]:
 _INT, _FLOAT = np.int64, np.float64
 NODE = _record(
     tokens=_FLOAT, busy_until=_FLOAT, next_status=_FLOAT, next_digest=_FLOAT, next_scan=_FLOAT, next_plan=_FLOAT,
-    scan_clock=_INT, pending_clock=_INT, pending_bytes=_INT, pending_slot=_INT, canvas=_INT, sequence=_INT, dropped=_INT,
-    wanted=_INT, digest_unit=_INT, digest_units=_INT, digest_parts=_INT,
+    scan_clock=_INT, pending_clock=_INT, pending_bytes=_INT, pending_slot=_INT, canvas=_INT, sequence=_INT,
+    dropped=_INT, wanted=_INT, digest_unit=_INT, digest_units=_INT, digest_parts=_INT,
     first_message=_INT, messages=_INT, busy_slots=_INT, scans=_INT,
     first_tile=_INT, tiles=_INT, first_digest=_INT, digests=_INT, tiles_first=np.bool_,
 )  # fmt: skip
@@ -66,9 +66,11 @@ LINK = _record(delivered=_INT, delivered_bytes=_INT, lost=_INT, lost_bytes=_INT,
 """What became of the messages from one drone to another, and for how many ticks the two were in reach."""
 MESSAGE = _record(
     arrival=_FLOAT, x=_FLOAT, y=_FLOAT, yaw=_FLOAT, vx=_FLOAT, vy=_FLOAT, sequence=_INT, hears=_INT,
-    kind=np.int32, size=np.int32, slot=np.int32, source=np.int32, count=np.int32, first_unit=np.int32, last_unit=np.int32,
+    kind=np.int32, size=np.int32, slot=np.int32, source=np.int32, count=np.int32,
+    first_unit=np.int32, last_unit=np.int32,
 )  # fmt: skip
-"""A message in flight. `slot` belongs to scans, `source` and `count` to tiles, the units to digests, `hears` and velocity to statuses."""
+"""A message in flight. `slot` belongs to scans, `source` and `count` to tiles, the units to digests, `hears` and the
+velocity to statuses."""
 WINDOW = _record(row=_INT, column=_INT, clock=_INT, x=_FLOAT, y=_FLOAT, yaw=_FLOAT)
 """A scan in flight: the grid's row and column of its first mark (a whole number of tiles; both may lie off the grid),
 the sender's clock after the scan, and its pose."""
@@ -105,12 +107,12 @@ class AirState(NamedTuple):
     """All arrays of the air, for kernels to take whole; `[worlds, drones, ...]`.
 
     For others to read: `reach` uint8 `[..., drones]`, who hears whom this tick; `links` LINK and `peers` PEER
-    `[..., drones]`; `counters` int64 `[..., 11]`. The rest: `nodes` NODE; `messages` MESSAGE, a ring; slots of scans
-    (`windows` WINDOW, `marks` int8 `[..., rows, columns]` and the rows of `spans` that hold any); rings of tiles (`tile_cells` int8, `tile_keys` place and version)
-    and of digests (uint32 `[..., source, tile]`); `holdings` uint32 `[..., peer, source, tile]` the versions that
-    peers are known to hold; `notes` TILE_NOTE `[..., source, tile]`; `wanted` int64 the queue of tiles; `known` int8
-    `[..., row, column]` the cells that ever had evidence; `confirmed` int8 `[..., source, row, column]` the cells of
-    tiles as their source sent them, kept only for passing on.
+    `[..., drones]`; `counters` int64 `[..., 11]`. The rest: `nodes` NODE; `messages` MESSAGE, a ring; slots of scans,
+    with `windows` WINDOW, `marks` int8 `[..., rows, columns]` and the `spans` of rows that hold any; rings of tiles
+    (`tile_cells` int8, `tile_keys` place and version) and of digests (uint32 `[..., source, tile]`); `holdings` uint32
+    `[..., peer, source, tile]` the versions that peers are known to hold; `notes` TILE_NOTE `[..., source, tile]`;
+    `wanted` int64 the queue of tiles; `known` int8 `[..., row, column]` the cells that ever had evidence; `confirmed`
+    int8 `[..., source, row, column]` the cells of tiles as their source sent them, kept only for passing on.
     """
 
     rules: AirRules
@@ -196,7 +198,7 @@ class Air:
         """Memory of one drone of one world."""
         arrays = [array for name, array in self.state._asdict().items() if name != "rules"]
         worlds, drones = self.state.nodes.shape
-        return math.ceil(sum(array.nbytes for array in arrays) / (worlds * drones))
+        return math.ceil(sum(int(array.nbytes) for array in arrays) / int(worlds * drones))
 
 
 def _rules(radio: RadioSettings, mesh: MeshSettings, lidar: LidarSpec, range_cap_m: float, tick_s: float) -> AirRules:

@@ -16,8 +16,6 @@ from imagine.sim.air import (
     BYTES_SENT,
     DIGEST,
     MESSAGES_SENT,
-    MOST_WANTED,
-    NEVER,
     SCAN,
     STATUS,
     TILES,
@@ -33,20 +31,18 @@ from imagine.sim.air_costs import (
     tile_in_message_bytes,
     tiles_message_bytes,
 )
+from imagine.sim.air_plan import plan, source_and_tile
 from imagine.sim.air_receive import is_live
 from imagine.sim.air_tiles import copy_tile, erase, find_spans
 
 # these are those of mesh_comm.node, tile_exchange and digest
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4
-_DIGEST_GRACE_S = 0.25
 _EPSILON_S = 1e-6
 _MAX_PAYLOAD = MAX_DATAGRAM - OVERHEAD
 _RESERVED_TILE, _RESERVED_TILES = 16, 10
 _RESERVED_HOLDING, _RESERVED_DIGEST = 24, 24
 _MOST_TILES = 256
-
-_ROWS, _PLACES, _SOURCES, _STALE, _MISSING = 1 << 12, 1 << 24, 1 << 6, 1 << 24, 1 << 6  # digits of a queue entry
 
 
 @numba.njit(cache=True, nogil=True)
@@ -111,7 +107,7 @@ def send(air, world, tick, poses, velocity, ranges, clocks, layers, versions):  
             node.next_plan = now + _PLAN_PERIOD_S
             node.wanted = 0
             if shares:
-                _plan(air, world, tick, drone, live, versions)
+                plan(air, world, tick, drone, live, versions)
         if now >= node.next_status - _EPSILON_S:
             said = _send_status(
                 rules, now, node, messages[drone], counters[drone], peers[drone], poses[drone], velocity[drone], live
@@ -247,72 +243,6 @@ def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[n
 
 
 @numba.njit(cache=True, nogil=True)
-def _plan(air, world, tick, drone, live, versions):  # type: ignore[no-untyped-def]
-    """Queue the tiles that some peer in touch, by its last digest, lacks: most lacking first, then most outdated.
-
-    A queue entry is its rank and place in one number, least first.
-    """
-    rules, node, peers = air.rules, air.nodes[world, drone], air.peers[world, drone]
-    rate, drones, tile_columns = rules.ticks_per_s, versions.shape[1], versions.shape[3]
-    now = tick / rate
-    wanted, holdings = air.wanted[world, drone], air.holdings[world, drone]
-    readers = 0  # a bit for each peer in touch that has told what it holds
-    for peer in range(drones):
-        if peers[peer].digest_tick >= 0:
-            readers |= live & 1 << peer
-    for source in range(drones):
-        if readers == 0 or (source != drone and not rules.relays):
-            continue
-        held, notes = versions[drone, source], air.notes[world, drone, source]
-        for tile in range(notes.shape[0]):
-            row, column = tile // tile_columns, tile % tile_columns
-            version = np.int64(held[row, column])
-            if version == 0:
-                continue
-            note = notes[tile]
-            was_sent = note.sent_tick > NEVER
-            sent_at = note.sent_tick / rate
-            if was_sent and now - sent_at < rules.tile_period:
-                continue
-            missing, stale = 0, 0
-            for peer in range(drones):
-                has = np.int64(holdings[peer, source, tile])
-                if has >= version or (readers >> peer) & 1 == 0 or peer == source:
-                    continue
-                if was_sent and np.int64(note.sent_version) >= version:
-                    if peers[peer].digest_tick / rate < sent_at + _DIGEST_GRACE_S:
-                        continue  # sent since this peer last told what it holds
-                if source != drone and (readers >> source) & 1 == 1:
-                    if (peers[peer].hears >> source) & 1 == 1 and (peers[source].hears >> peer) & 1 == 1:
-                        continue  # source and peer hear each other: the source sends its newest tiles itself
-                missing += has == 0
-                stale += version - has
-            if stale > 0:
-                rank = (_MISSING - 1 - missing) * _STALE + max(0, _STALE - 1 - stale)
-                place = column * _ROWS + row  # ties in the order of tile keys
-                wanted[node.wanted] = ((rank * 2 + (source != drone)) * _SOURCES + source) * _PLACES + place
-                node.wanted += 1
-    _sort(wanted, node.wanted)
-    node.wanted = min(node.wanted, MOST_WANTED)
-
-
-@numba.njit(cache=True, nogil=True)
-def _sort(values, count):  # type: ignore[no-untyped-def]
-    """Sort the first `count` values, in place: a Shell sort with Knuth's gaps (1973), for it needs no memory."""
-    gap = 1
-    while gap < count // 3:
-        gap = 3 * gap + 1
-    while gap > 0:
-        for i in range(gap, count):
-            value, j = values[i], i
-            while j >= gap and values[j - gap] > value:
-                values[j] = values[j - gap]
-                j -= gap
-            values[j] = value
-        gap //= 3
-
-
-@numba.njit(cache=True, nogil=True)
 def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-untyped-def]
     """Send the queue, a datagram of one source's tiles at a time; False when bytes or rings run short."""
     node, wanted = air.nodes[world, drone], air.wanted[world, drone]
@@ -320,14 +250,14 @@ def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-u
     tile_columns, slots = versions.shape[3], air.tile_cells.shape[2]
     now = tick / air.rules.ticks_per_s
     while node.wanted > 0:
-        source = wanted[0] // _PLACES % _SOURCES
+        source, _, _ = source_and_tile(wanted[0])
         cells = layers[drone, source] if source == drone else air.confirmed[world, drone, source]
         held, notes = versions[drone, source], air.notes[world, drone, source]
         reserved, size, count = _RESERVED_TILES, 0, 0
         for entry in range(node.wanted):
-            if wanted[entry] // _PLACES % _SOURCES != source:
+            its_source, row, column = source_and_tile(wanted[entry])
+            if its_source != source:
                 continue
-            row, column = wanted[entry] % _ROWS, wanted[entry] % _PLACES // _ROWS
             note = notes[row * tile_columns + column]
             if note.cost_version != held[row, column]:
                 note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), held[row, column]
@@ -342,11 +272,11 @@ def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-u
         place = _transmit(air.rules, now, node, messages, counters, TILES, size)
         left = taken = 0
         for entry in range(node.wanted):
-            if taken == count or wanted[entry] // _PLACES % _SOURCES != source:
+            its_source, row, column = source_and_tile(wanted[entry])
+            if taken == count or its_source != source:
                 wanted[left] = wanted[entry]
                 left += 1
                 continue
-            row, column = wanted[entry] % _ROWS, wanted[entry] % _PLACES // _ROWS
             tile = row * tile_columns + column
             if place >= 0:
                 slot = (node.first_tile + node.tiles + taken) % slots

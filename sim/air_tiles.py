@@ -17,10 +17,10 @@ def draw_marks(cells, marks, row0, rows, column0, mark_row0, mark_column0):  # t
 
     Returns how many cells changed, and how many of them had no evidence before.
     """
-    changed = first = 0
+    changed, first = np.int64(0), np.int64(0)
     for i in range(rows):
         row, mark_row = np.uintp(row0 + i), np.uintp(mark_row0 + i)
-        row_changed = row_first = np.int8(0)  # of its own, so that rows need not wait for each other
+        row_changed, row_first = np.int8(0), np.int8(0)  # of its own, so that rows need not wait for each other
         for k in range(TILE):
             column = np.uintp(column0 + k)
             old = cells[row, column]
@@ -30,15 +30,15 @@ def draw_marks(cells, marks, row0, rows, column0, mark_row0, mark_column0):  # t
             row_changed = np.int8(row_changed + differs)
             row_first = np.int8(row_first + np.int8(differs & np.int8(old == 0)))
             cells[row, column] = new
-        changed += row_changed
-        first += row_first
+        changed += np.int64(row_changed)
+        first += np.int64(row_first)
     return changed, first
 
 
 @numba.njit(cache=True, nogil=True)
 def claim(cells, known, row0, rows, column0):  # type: ignore[no-untyped-def]
     """Mark the cells with evidence in so many rows of one tile's width as known; return how many were not before."""
-    fresh = 0
+    fresh = np.int64(0)
     for i in range(rows):
         row = np.uintp(row0 + i)
         row_fresh = np.int8(0)
@@ -47,7 +47,7 @@ def claim(cells, known, row0, rows, column0):  # type: ignore[no-untyped-def]
             has_evidence, was_known = np.int8(cells[row, column] != 0), known[row, column]
             row_fresh = np.int8(row_fresh + np.int8(has_evidence & ~was_known))
             known[row, column] = np.int8(was_known | has_evidence)
-        fresh += row_fresh
+        fresh += np.int64(row_fresh)
     return fresh
 
 
@@ -64,7 +64,7 @@ def copy_tile(source, row0, column0, target, target_row0, target_column0):  # ty
 
 @numba.njit(cache=True, nogil=True)
 def find_spans(marks, spans):  # type: ignore[no-untyped-def]
-    """Note in `spans` `[tiles, 2]`, for each tile's width of `marks`, the first row with any mark and one past the last.
+    """Note in `spans` `[tiles, 2]`, for each tile's width of `marks`, the first row with any and one past the last.
 
     Most of a scan's square lies behind walls, and what need not be read need not be fetched.
     """
