@@ -33,7 +33,7 @@ from imagine.sim.air_costs import (
 )
 from imagine.sim.air_plan import plan, source_and_tile
 from imagine.sim.air_receive import is_live
-from imagine.sim.air_tiles import copy_tile, erase, find_spans
+from imagine.sim.air_tiles import copy_tile, find_spans
 
 # these are those of mesh_comm.node, tile_exchange and digest
 _PLAN_PERIOD_S = 0.2
@@ -50,9 +50,10 @@ def canvas(air, world, drone, row, column):  # type: ignore[no-untyped-def]
     """Return (slot, first row, first column): where the next scan of `drone`, in cell (row, column), is to be drawn.
 
     The marks are `air.marks[world, drone, slot]` (int8 `[side, side or more]`), with an older scan to be painted over:
-    -1 for a miss, +2 for a hit, 0 untouched. Their first cell is (first row, first column) of the grid; both may lie off it, and so may cells. With
-    `side` = 2 n + 1, n the range cap in cells, rounded up, plus 1, the drone's cell is in the middle row, and the
-    columns reach n to both sides. `send` takes the marks from there; what is drawn is kept until it has arrived.
+    -1 for a miss, +2 for a hit, 0 untouched. Their first cell is (first row, first column) of the grid; both may lie
+    off it, and so may cells. With `side` = 2 n + 1, n the range cap in cells, rounded up, plus 1, the drone's cell is
+    in the middle row, and the columns reach n to both sides. `send` takes the marks from there; what is drawn is kept
+    until it has arrived.
     """
     node = air.nodes[world, drone]
     taken = node.busy_slots

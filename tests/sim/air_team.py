@@ -49,7 +49,15 @@ class AirTeam:
         still = np.zeros((self.drones, 3)) if velocities is None else velocities
         state = self.air.state
         deliver(
-            state, self.world, self.ticks, self.key, poses, self.alive, self.level.segments, self.layers, self.versions,
+            state,
+            self.world,
+            self.ticks,
+            self.key,
+            poses,
+            self.alive,
+            self.level.segments,
+            self.layers,
+            self.versions,
             self.dirty,
         )
         if ranges is not None:
