@@ -248,7 +248,7 @@ class Exploration:
         twin.workers.over(self.worlds, run_part, scratch=self.maps.scratch)
         twin.ticks += 1
         active = modes != WAITING
-        self.decisions.sense(self.estimates, self.links(), self.maps.origins, self.alive, active, self.dt)
+        self.decisions.sense(self.estimates, self.air, self.ticks, self.maps.origins, self.alive, active)
         if observes:
             self.decisions.fill(seen["views"], seen["motion"], self.estimates, self.maps.origins)
 
