@@ -294,9 +294,10 @@ def test_a_large_map_is_exchanged_in_datagrams_that_fit() -> None:
     clocks, dirty = np.zeros(drones, np.uint32), np.zeros((drones, rows, columns), np.uint8)
     largest = 0
     nothing = np.zeros((0, 4)), np.full((drones, 360), np.nan, np.float32)
+    alive = np.ones(drones, np.bool_)
     for tick in range(1, 2400):
-        deliver(air.state, 0, tick, np.uint64(1), poses, nothing[0], layers, versions, dirty)
-        send(air.state, 0, tick, poses, np.zeros((drones, 3)), nothing[1], clocks, layers, versions)
+        deliver(air.state, 0, tick, np.uint64(1), poses, alive, nothing[0], layers, versions, dirty)
+        send(air.state, 0, tick, poses, np.zeros((drones, 3)), alive, nothing[1], clocks, layers, versions)
         largest = max(largest, int(air.state.messages["size"].max()))
         if tick % 50 == 0 and all((versions[:, source] == versions[source, source]).all() for source in range(drones)):
             break
@@ -304,6 +305,17 @@ def test_a_large_map_is_exchanged_in_datagrams_that_fit() -> None:
         assert (versions[:, source] == versions[source, source]).all()
         assert (layers[:, source] == layers[source, source]).all()
     assert 1000 < largest <= MAX_DATAGRAM
+
+
+def test_the_fallen_neither_speak_nor_hear() -> None:
+    fallen = team(protocol="multi-hop")
+    fallen.alive[1] = False  # the one in the middle of the chain
+    for _ in range(10):
+        fallen.tick(CHAIN, None)
+    assert not fallen.bytes_sent[1].any()
+    assert fallen.bytes_sent[[0, 2]].all(axis=0)[3]
+    assert not fallen.air.state.reach[0].any()
+    assert (fallen.air.state.peers[0]["heard_tick"] < 0).all()
 
 
 def test_a_peer_is_expected_where_it_was_heading_and_forgotten_when_silent() -> None:
