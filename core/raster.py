@@ -127,8 +127,8 @@ def mark_scan(  # type: ignore[no-untyped-def]
     Return (row, column), in cells of the map frame, of its first cell; the column is a tile's first. A cell takes one
     mark, a hit before a miss, so near cells crossed by many beams are not counted many times. Beams run along
     Bresenham lines and are cut at `range_cap` metres; inf frees the whole length, nan and what is nearer than
-    `range_min` say nothing. Ranges are rounded to RANGE_STEP_M. Pose in metres and radians; `directions` of `beam_directions`; `starts` and
-    `offsets` are the ray table's.
+    `range_min` say nothing. Ranges are rounded to RANGE_STEP_M. Pose in metres and radians; `directions` of
+    `beam_directions`; `starts` and `offsets` are the ray table's.
     """
     ends, width = marks.shape
     reach = ends // 2

@@ -62,8 +62,8 @@ def test_beliefs_grow_alike(pair: Pair) -> None:
     most = pair.real_known[-1].max()
     apart = np.abs(pair.known - pair.real_known) / most
     assert pair.real_known[-1].min() > 5000
-    assert apart.mean() < 0.005
-    assert apart.max() < 0.05
+    assert apart.mean() < 0.001
+    assert apart.max() < 0.01
 
 
 def test_what_was_exchanged_is_the_same_map(pair: Pair) -> None:
