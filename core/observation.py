@@ -210,7 +210,11 @@ def fill_sectors(sectors, ranges, range_min, start, increment, turn, range_m):  
         if not r >= range_min:
             continue
         bearing = start + beam * increment + turn
-        sector = math.floor(bearing / (2.0 * math.pi) * count) % count
+        sector = math.floor(bearing / (2.0 * math.pi) * count)
+        while sector < 0:  # at most a turn or two, and far cheaper than a division
+            sector += count
+        while sector >= count:
+            sector -= count
         sectors[sector] = min(sectors[sector], np.float32(min(r / range_m, 1.0)))
 
 
