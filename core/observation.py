@@ -61,8 +61,10 @@ def _fill_aligned(  # type: ignore[no-untyped-def]
     count = max(0, min(n, (columns - column) // block) - first)  # pixels within the grid, of which both are multiples
     last_row = min(n, (rows - row) // block)
     out, near = occupancy.ravel(), frontier.ravel()
-    out[:] = 0.0
-    near[:] = 1.0
+    if count < n or last_row - first_row < n:
+        out[:] = 0.0
+    if count < n or last_row - first_row < n or own >= FAR:
+        near[:] = 1.0
     if count == 0 or last_row <= first_row:
         return
     begin = column + first * block
