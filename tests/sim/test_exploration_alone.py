@@ -37,11 +37,11 @@ def assert_same(one: Any, other: Any, where: str) -> None:
         for a, b in zip(one, other, strict=True):
             assert_same(a, b, where)
     else:
-        assert np.asarray(one).dtype == np.asarray(other).dtype, where
-        if np.asarray(one).dtype.kind == "V":
-            assert one.tobytes() == other.tobytes(), where
-        else:
+        one, other = np.asarray(one), np.asarray(other)
+        assert one.dtype == other.dtype, where
+        if one.tobytes() != other.tobytes() or one.shape != other.shape:
             np.testing.assert_array_equal(one, other, err_msg=where)
+            pytest.fail(f"equal numbers, but not bit for bit: {where}")
 
 
 @pytest.mark.parametrize(
