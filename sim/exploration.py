@@ -214,7 +214,7 @@ class Exploration:
         return earned
 
     def _run(self, modes: NDArray[np.int64], shown: NDArray[np.int64]) -> None:
-        """Run a tick in all worlds, as `modes` says for each, and observe those whose mode in `shown` is not WAITING."""
+        """Run a tick in all worlds, as `modes` says for each; observe those whose mode in `shown` is not WAITING."""
         observes = bool((shown != WAITING).any())
         twin = self.twin
         sensors, flight = twin.sensors(self._sight_m), twin.kernel_args()
