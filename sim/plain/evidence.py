@@ -81,7 +81,8 @@ def integrate_scan(
     hit = measured <= range_cap_m
     steps = np.rint(np.where(hit, measured, range_cap_m) / RANGE_STEP_M)
     steps = np.clip(steps, 1.0, math.floor(range_cap_m / RANGE_STEP_M + 1e-9))  # a hit is never rounded past the cap
-    lengths = np.where(hit, (steps * RANGE_STEP_M).astype(np.float32), range_cap_m)
+    rounded = (steps * RANGE_STEP_M).astype(np.float32).astype(np.float64)  # as a peer reads them
+    lengths = np.where(hit, rounded, range_cap_m)
     c, s = math.cos(yaw), math.sin(yaw)
     cos_beam, sin_beam = np.cos(lidar.bearings[usable]), np.sin(lidar.bearings[usable])
     end_x, end_y = x + lengths * (c * cos_beam - s * sin_beam), y + lengths * (s * cos_beam + c * sin_beam)
