@@ -197,6 +197,7 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
         old = np.int64(costs[cell])
         if 0 <= old < FAR:
             entry_cell[entries], entry_next[entries], heads[old] = cell, heads[old], entries
+            is_dirty[cell] |= np.uint8(2)
             entries += 1
             lowest = min(lowest, old)
     count = _drop_unsupported(costs, flat_kinds, np.uint32(width), lowest, entries, dirty, count, is_dirty, scratch)
@@ -253,7 +254,8 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
 ):
     """Set to FAR, from the queued cells on, what no neighbour's cost explains any more; note it, return the count.
 
-    Cells come by their old cost, so that what may support a cell has been looked at before it.
+    Cells come by their old cost, so that what may support a cell has been looked at before it; each comes once, which
+    the second bit of `is_dirty` sees to.
     """
     heads, entry_cell, entry_next = scratch
     found, at = np.empty(9, np.uint32), np.empty(9, np.int64)
@@ -265,8 +267,6 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
             heads[level] = entry_next[entry]
             queued -= 1
             cell = np.uint32(entry_cell[entry])
-            if costs[cell] != level:
-                continue  # it came twice, and was dropped the first time
             kind = kinds[cell]
             if level == 0:
                 if kind & np.uint8(_FRONTIER):
@@ -274,8 +274,8 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
             elif _least(costs, kinds, cell, width) <= level:
                 continue
             costs[cell] = FAR
-            if is_dirty[cell] == 0:
-                is_dirty[cell] = 1
+            if not is_dirty[cell] & np.uint8(1):
+                is_dirty[cell] |= np.uint8(1)
                 dirty[count] = cell
                 count += 1
             # What may have come this way is looked at next; corners do not matter, it can only prove supported.
@@ -283,27 +283,30 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
             ne, nw, se, sw = np.uint32(n + one), np.uint32(n - one), np.uint32(s + one), np.uint32(s - one)
             ways = np.uint64(0)
             found[ways], at[ways] = e, _onward(level, kind | kinds[e], _STRAIGHT)
-            ways += np.uint64(at[ways] == costs[e])
+            ways += np.uint64((at[ways] == costs[e]) & (is_dirty[e] < 2))
             found[ways], at[ways] = w, _onward(level, kind | kinds[w], _STRAIGHT)
-            ways += np.uint64(at[ways] == costs[w])
+            ways += np.uint64((at[ways] == costs[w]) & (is_dirty[w] < 2))
             found[ways], at[ways] = n, _onward(level, kind | kinds[n], _STRAIGHT)
-            ways += np.uint64(at[ways] == costs[n])
+            ways += np.uint64((at[ways] == costs[n]) & (is_dirty[n] < 2))
             found[ways], at[ways] = s, _onward(level, kind | kinds[s], _STRAIGHT)
-            ways += np.uint64(at[ways] == costs[s])
+            ways += np.uint64((at[ways] == costs[s]) & (is_dirty[s] < 2))
             found[ways], at[ways] = ne, _onward(level, kind | kinds[ne], _DIAGONAL)
-            ways += np.uint64(at[ways] == costs[ne])
+            ways += np.uint64((at[ways] == costs[ne]) & (is_dirty[ne] < 2))
             found[ways], at[ways] = nw, _onward(level, kind | kinds[nw], _DIAGONAL)
-            ways += np.uint64(at[ways] == costs[nw])
+            ways += np.uint64((at[ways] == costs[nw]) & (is_dirty[nw] < 2))
             found[ways], at[ways] = se, _onward(level, kind | kinds[se], _DIAGONAL)
-            ways += np.uint64(at[ways] == costs[se])
+            ways += np.uint64((at[ways] == costs[se]) & (is_dirty[se] < 2))
             found[ways], at[ways] = sw, _onward(level, kind | kinds[sw], _DIAGONAL)
-            ways += np.uint64(at[ways] == costs[sw])
+            ways += np.uint64((at[ways] == costs[sw]) & (is_dirty[sw] < 2))
             for k in range(ways):
                 target = at[k]
                 entry_cell[entries], entry_next[entries], heads[target] = found[k], heads[target], entries
+                is_dirty[found[k]] |= np.uint8(2)
                 entries += 1
                 queued += 1
         level += 1
+    for k in range(entries):
+        is_dirty[entry_cell[k]] &= np.uint8(1)
     return count
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from imagine.core.errors import InputError
 from imagine.core.lidar import TEAMMATE_RADIUS_M
 from imagine.sim.air import Air
-from imagine.sim.air_receive import claim_all
+from imagine.sim.air_receive import claim_own
 from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
 from imagine.sim.decision_state import DecisionState
 from imagine.sim.exploration_settings import ExplorationSettings
@@ -279,7 +279,7 @@ class Exploration:
 
     def _metrics(self, world: int) -> EpisodeMetrics:
         maps, twin, own = self.maps, self.twin, range(self.drones)
-        claim_all(self.air.state, world, maps.layers[world], maps.versions[world])
+        claim_own(self.air.state, world, maps.layers[world])
         totals = EpisodeTotals(
             level=twin.levels[world].name,
             coverable=int(maps.coverable_cells[world]),
