@@ -171,7 +171,7 @@ def test_with_exchange_own_maps_are_the_same_and_the_rest_is_within_a_tenth(rule
     alone = (plain.maps.layer(0, 0) != 0).sum()
     assert known(plain, env, 0)[0][0] > 1.1 * alone
     assert np.max(apart) < 0.1
-    assert np.mean(apart) < 0.02
+    assert np.mean(apart) < 0.01
     mine, theirs = plain.mesh.bytes_sent(), env.air.bytes_sent[0]
     np.testing.assert_allclose(mine.sum(axis=0), theirs.sum(axis=0), rtol=0.1)
     np.testing.assert_allclose(mine.sum(axis=1), theirs.sum(axis=1), rtol=0.1)
@@ -210,12 +210,14 @@ def test_a_world_is_taken_over_in_the_middle_of_an_episode(protocol: str) -> Non
     for _ in range(10):  # until it is forgotten that nobody knew when what was sent
         tick_together(env, plain, 1, planned(env))
     before = plain.mesh.bytes_sent().sum(), env.air.bytes_sent[1].sum()
+    apart = []
     for _ in range(140):
         tick_together(env, plain, 1, planned(env))
         mine, theirs = known(plain, env, 1)
-        np.testing.assert_allclose(mine, theirs, rtol=0.02)
-    mine, theirs = own_maps(plain, env, 1)
-    assert np.count_nonzero(mine != theirs) < 1e-3 * mine.size
+        apart.append(np.abs(mine / theirs - 1.0))
+    assert np.mean(apart) < 0.01  # where two meet again, much is told at once, here or there a tick or two sooner
+    assert np.quantile(apart, 0.95) < 0.01
+    np.testing.assert_array_equal(*own_maps(plain, env, 1))
     sent = plain.mesh.bytes_sent().sum() - before[0], env.air.bytes_sent[1].sum() - before[1]
     assert sent[0] == pytest.approx(sent[1], rel=0.1)
 
