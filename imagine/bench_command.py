@@ -130,10 +130,8 @@ def growth_table(plan: BenchPlan, what: str, results: Results) -> Table:
     if what == "worlds":
         for name, of in (("memory_a_drone", "arrays"), ("resident_a_drone", "resident memory")):
             if (line := results.get(name)) is not None:
-                notes.append(
-                    f"{of} over all sizes: {line['value'] / 1e6:.2f} MB a drone and {line['fixed'] / 1e6:.0f} MB for all, "
-                    f"within {line['off']:.0%}"
-                )
+                each, whole = line["value"] / 1e6, line["fixed"] / 1e6
+                notes.append(f"{of}: {each:.2f} MB a drone and {whole:.0f} MB for all, within {line['off']:.0%}")
     table.caption = "\n".join(notes)
     return table
 

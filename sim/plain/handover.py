@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imagine.core.evidence import TileKey
 from imagine.core.frames import Pose
@@ -22,7 +23,8 @@ _LONG_AGO_S = -1e3
 
 def hand_over_maps(batch: Exploration, world: int, maps: PlainMaps) -> None:
     """Write a world's layers, versions, clocks and coverage into plain maps of the same level."""
-    arrays, notes = batch.maps.arrays, batch.air.state.notes[world]["provisional"]
+    arrays = batch.maps.arrays
+    provisional = batch.air.state.notes[world]["provisional"].reshape(arrays.versions.shape[1:])
     rows, columns = maps.tiles
     for drone, own in enumerate(maps.evidence):
         for source in range(batch.drones):
@@ -30,8 +32,7 @@ def hand_over_maps(batch: Exploration, world: int, maps: PlainMaps) -> None:
             cells[...] = arrays.layers[world, drone, source, : cells.shape[0], : cells.shape[1]]
             versions = maps.versions(drone, source)
             versions[...] = arrays.versions[world, drone, source, :rows, :columns]
-            provisional = notes[drone, source].reshape(arrays.versions.shape[3:])[:rows, :columns]
-            for row, column in np.argwhere(provisional).tolist():
+            for row, column in np.argwhere(provisional[drone, source, :rows, :columns]).tolist():
                 at = row + maps.corner.row - own.corner.row, column + maps.corner.column - own.corner.column
                 own.layers[source + 1].provisional[at] = True
             own.layers[source + 1].clock = int(versions.max())
@@ -71,7 +72,7 @@ def hand_over_mesh(batch: Exploration, world: int, maps: PlainMaps, mesh: PlainM
                 mesh.tell(sender, receiver, digest, at)
 
 
-def _listed(versions: np.ndarray, batch: Exploration, maps: PlainMaps) -> dict[TileKey, int]:
+def _listed(versions: NDArray[np.uint32], batch: Exploration, maps: PlainMaps) -> dict[TileKey, int]:
     """Return the held ones of a batch's tiles, by their place."""
     columns = batch.maps.versions.shape[4]
     return {
