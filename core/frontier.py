@@ -282,22 +282,30 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
             e, w, n, s = np.uint32(cell + one), np.uint32(cell - one), np.uint32(cell + width), np.uint32(cell - width)
             ne, nw, se, sw = np.uint32(n + one), np.uint32(n - one), np.uint32(s + one), np.uint32(s - one)
             ways = np.uint64(0)
-            found[ways], at[ways] = e, _onward(level, kind | kinds[e], _STRAIGHT)
-            ways += np.uint64((at[ways] == costs[e]) & (is_dirty[e] < 2))
-            found[ways], at[ways] = w, _onward(level, kind | kinds[w], _STRAIGHT)
-            ways += np.uint64((at[ways] == costs[w]) & (is_dirty[w] < 2))
-            found[ways], at[ways] = n, _onward(level, kind | kinds[n], _STRAIGHT)
-            ways += np.uint64((at[ways] == costs[n]) & (is_dirty[n] < 2))
-            found[ways], at[ways] = s, _onward(level, kind | kinds[s], _STRAIGHT)
-            ways += np.uint64((at[ways] == costs[s]) & (is_dirty[s] < 2))
-            found[ways], at[ways] = ne, _onward(level, kind | kinds[ne], _DIAGONAL)
-            ways += np.uint64((at[ways] == costs[ne]) & (is_dirty[ne] < 2))
-            found[ways], at[ways] = nw, _onward(level, kind | kinds[nw], _DIAGONAL)
-            ways += np.uint64((at[ways] == costs[nw]) & (is_dirty[nw] < 2))
-            found[ways], at[ways] = se, _onward(level, kind | kinds[se], _DIAGONAL)
-            ways += np.uint64((at[ways] == costs[se]) & (is_dirty[se] < 2))
-            found[ways], at[ways] = sw, _onward(level, kind | kinds[sw], _DIAGONAL)
-            ways += np.uint64((at[ways] == costs[sw]) & (is_dirty[sw] < 2))
+            reached = _onward(level, kind | kinds[e], _STRAIGHT)
+            found[ways], at[ways] = e, reached
+            ways += np.uint64((reached == costs[e]) & (is_dirty[e] < 2))
+            reached = _onward(level, kind | kinds[w], _STRAIGHT)
+            found[ways], at[ways] = w, reached
+            ways += np.uint64((reached == costs[w]) & (is_dirty[w] < 2))
+            reached = _onward(level, kind | kinds[n], _STRAIGHT)
+            found[ways], at[ways] = n, reached
+            ways += np.uint64((reached == costs[n]) & (is_dirty[n] < 2))
+            reached = _onward(level, kind | kinds[s], _STRAIGHT)
+            found[ways], at[ways] = s, reached
+            ways += np.uint64((reached == costs[s]) & (is_dirty[s] < 2))
+            reached = _onward(level, kind | kinds[ne], _DIAGONAL)
+            found[ways], at[ways] = ne, reached
+            ways += np.uint64((reached == costs[ne]) & (is_dirty[ne] < 2))
+            reached = _onward(level, kind | kinds[nw], _DIAGONAL)
+            found[ways], at[ways] = nw, reached
+            ways += np.uint64((reached == costs[nw]) & (is_dirty[nw] < 2))
+            reached = _onward(level, kind | kinds[se], _DIAGONAL)
+            found[ways], at[ways] = se, reached
+            ways += np.uint64((reached == costs[se]) & (is_dirty[se] < 2))
+            reached = _onward(level, kind | kinds[sw], _DIAGONAL)
+            found[ways], at[ways] = sw, reached
+            ways += np.uint64((reached == costs[sw]) & (is_dirty[sw] < 2))
             for k in range(ways):
                 target = at[k]
                 entry_cell[entries], entry_next[entries], heads[target] = found[k], heads[target], entries
@@ -339,22 +347,30 @@ def _settle(costs, kinds, width, level, queued, scratch):  # type: ignore[no-unt
             ne, nw, se, sw = np.uint32(n + one), np.uint32(n - one), np.uint32(s + one), np.uint32(s - one)
             ways = np.uint64(0)
             # BLOCKED is below all; a diagonal step cuts no corner: both cells beside it must be free
-            found[ways], at[ways] = e, _onward(level, kind | kinds[e], _STRAIGHT)
-            ways += np.uint64(at[ways] < costs[e])
-            found[ways], at[ways] = w, _onward(level, kind | kinds[w], _STRAIGHT)
-            ways += np.uint64(at[ways] < costs[w])
-            found[ways], at[ways] = n, _onward(level, kind | kinds[n], _STRAIGHT)
-            ways += np.uint64(at[ways] < costs[n])
-            found[ways], at[ways] = s, _onward(level, kind | kinds[s], _STRAIGHT)
-            ways += np.uint64(at[ways] < costs[s])
-            found[ways], at[ways] = ne, _onward(level, kind | kinds[ne], _DIAGONAL)
-            ways += np.uint64((at[ways] < costs[ne]) & (costs[n] >= 0) & (costs[e] >= 0))
-            found[ways], at[ways] = nw, _onward(level, kind | kinds[nw], _DIAGONAL)
-            ways += np.uint64((at[ways] < costs[nw]) & (costs[n] >= 0) & (costs[w] >= 0))
-            found[ways], at[ways] = se, _onward(level, kind | kinds[se], _DIAGONAL)
-            ways += np.uint64((at[ways] < costs[se]) & (costs[s] >= 0) & (costs[e] >= 0))
-            found[ways], at[ways] = sw, _onward(level, kind | kinds[sw], _DIAGONAL)
-            ways += np.uint64((at[ways] < costs[sw]) & (costs[s] >= 0) & (costs[w] >= 0))
+            reached = _onward(level, kind | kinds[e], _STRAIGHT)
+            found[ways], at[ways] = e, reached
+            ways += np.uint64(reached < costs[e])
+            reached = _onward(level, kind | kinds[w], _STRAIGHT)
+            found[ways], at[ways] = w, reached
+            ways += np.uint64(reached < costs[w])
+            reached = _onward(level, kind | kinds[n], _STRAIGHT)
+            found[ways], at[ways] = n, reached
+            ways += np.uint64(reached < costs[n])
+            reached = _onward(level, kind | kinds[s], _STRAIGHT)
+            found[ways], at[ways] = s, reached
+            ways += np.uint64(reached < costs[s])
+            reached = _onward(level, kind | kinds[ne], _DIAGONAL)
+            found[ways], at[ways] = ne, reached
+            ways += np.uint64((reached < costs[ne]) & (costs[n] >= 0) & (costs[e] >= 0))
+            reached = _onward(level, kind | kinds[nw], _DIAGONAL)
+            found[ways], at[ways] = nw, reached
+            ways += np.uint64((reached < costs[nw]) & (costs[n] >= 0) & (costs[w] >= 0))
+            reached = _onward(level, kind | kinds[se], _DIAGONAL)
+            found[ways], at[ways] = se, reached
+            ways += np.uint64((reached < costs[se]) & (costs[s] >= 0) & (costs[e] >= 0))
+            reached = _onward(level, kind | kinds[sw], _DIAGONAL)
+            found[ways], at[ways] = sw, reached
+            ways += np.uint64((reached < costs[sw]) & (costs[s] >= 0) & (costs[w] >= 0))
             for k in range(ways):
                 other, reached = found[k], at[k]
                 costs[other] = reached

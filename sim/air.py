@@ -57,11 +57,11 @@ scan that waits to be sent (clock 0 for none); `canvas` the slot of scans that t
 bit for each slot in flight; `wanted` tiles are queued; rings have a first and a count. `dropped` messages found the
 radio's queue full."""
 PEER = _record(
-    heard_tick=_INT, pose_tick=_INT, digest_tick=_INT, hears=_INT,
+    heard_tick=_INT, pose_tick=_INT, status_tick=_INT, digest_tick=_INT, hears=_INT,
     x=_FLOAT, y=_FLOAT, yaw=_FLOAT, vx=_FLOAT, vy=_FLOAT,
 )  # fmt: skip
-"""What a drone knows of another: when it heard it, its pose, its digest (NEVER before the first), whom it hears (a bit
-for each drone), and pose and velocity as last told."""
+"""What a drone knows of another: when it heard it, its pose, its status, its digest (NEVER before the first), whom it
+hears (a bit for each drone), and pose and velocity as last told."""
 LINK = _record(delivered=_INT, delivered_bytes=_INT, lost=_INT, lost_bytes=_INT, out_of_range=_INT, ticks=_INT)
 """What became of the messages from one drone to another, and for how many ticks the two were in reach."""
 MESSAGE = _record(
@@ -166,7 +166,7 @@ class Air:
         for name, array in self.state._asdict().items():
             if name != "rules":
                 array[world] = np.zeros((), array.dtype)  # a zero of any kind, records among them
-        for never in ("heard_tick", "pose_tick", "digest_tick"):
+        for never in ("heard_tick", "pose_tick", "status_tick", "digest_tick"):
             self.state.peers[world][never] = NEVER
         self.state.notes[world]["sent_tick"] = NEVER
         nodes = self.state.nodes[world]

@@ -136,6 +136,7 @@ def _hear(peer, tick, message):  # type: ignore[no-untyped-def]
     """Note that a peer was heard, and where it says it is."""
     peer.heard_tick = tick
     if message.kind == STATUS:
+        peer.status_tick = tick
         peer.hears, peer.vx, peer.vy = message.hears, message.vx, message.vy
     if message.kind == STATUS or message.kind == SCAN:
         peer.pose_tick = tick

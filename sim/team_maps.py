@@ -27,6 +27,8 @@ from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec
 from imagine.core.raster import LIMIT, TILE, apply_marks, beam_directions, mark_scan, ray_table
 from imagine.sim.workers import Workers
 
+_ROUNDING_M = 1e-6
+
 
 class MapArrays(NamedTuple):
     """The maps of all worlds, as kernels take them.
@@ -149,7 +151,7 @@ def integrate_scan_of(world, drone, maps, pens, ranges, pose, places, marks, kep
     `ranges` float32 `[beams]`, `pose` (x, y, yaw); `places` `[drones, 2]` are where it takes its teammates to be (nan:
     unknown), whose returns it leaves out. Draws into `marks`, a sheet as in `mark_scan`; `kept` is scratch for a scan.
     """
-    _without_teammates(kept, ranges, pens.directions, pose, places, pens.range_cap)
+    _without_teammates(kept, ranges, pens.directions, pose, places)
     row, column = mark_scan(
         marks, pose[0], pose[1], pose[2], pens.directions, kept, pens.range_min, pens.range_cap, pens.starts,
         pens.offsets,
@@ -172,19 +174,21 @@ def integrate_scan_of(world, drone, maps, pens, ranges, pose, places, marks, kep
 
 
 @numba.njit(cache=True, nogil=True)
-def _without_teammates(kept, ranges, directions, pose, places, range_cap):  # type: ignore[no-untyped-def]
+def _without_teammates(kept, ranges, directions, pose, places):  # type: ignore[no-untyped-def]
     """Copy a scan with its returns on teammates at `places` made invalid (nan)."""
     for beam in range(len(ranges)):
         kept[beam] = ranges[beam]
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for peer in range(len(places)):
         dx, dy = places[peer, 0] - pose[0], places[peer, 1] - pose[1]
-        if not dx * dx + dy * dy <= (range_cap + TEAMMATE_RADIUS_M) ** 2:  # nor where it is unknown
-            continue
+        apart = math.sqrt(dx * dx + dy * dy)
+        if not apart < np.inf:
+            continue  # nobody knows where it is
         ahead, left = c * dx + s * dy, -s * dx + c * dy
-        for beam in range(len(kept)):
+        nearest, furthest = apart - TEAMMATE_RADIUS_M - _ROUNDING_M, apart + TEAMMATE_RADIUS_M + _ROUNDING_M
+        for beam in range(len(kept)):  # returns beyond the range cap too, as on board: they free nothing either
             r = np.float64(kept[beam])
-            if r < np.inf:
+            if nearest < r < furthest:
                 ex, ey = r * directions[beam, 0] - ahead, r * directions[beam, 1] - left
                 if ex * ex + ey * ey < TEAMMATE_RADIUS_M * TEAMMATE_RADIUS_M:
                     kept[beam] = np.nan
