@@ -159,7 +159,7 @@ class ExplorationEnv(ParallelEnv):  # type: ignore[misc]  # PettingZoo carries n
     def _observations(self, observation: Observation) -> dict[str, PolicyObservation]:
         self._critic = np.clip(observation.critic[0], 0.0, 1.0)
         return {
-            agent: {name: array[0, self._drone(agent)] for name, array in observation.policy.items()}
+            agent: {name: array[0, self._drone(agent)].copy() for name, array in observation.policy.items()}
             for agent in self.agents
         }
 
