@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from imagine.core.action import Parameters, body_velocity_kernel
 from imagine.core.observation import MOTION, fill_motion, fill_sectors, fill_views
 from imagine.core.shield import shield_kernel
-from imagine.sim.air_receive import deliver, peer_place
+from imagine.sim.air_receive import deliver, meet, peer_place
 from imagine.sim.air_send import send
 from imagine.sim.physics import step_worlds
 from imagine.sim.scan_world import scan_world
@@ -97,6 +97,8 @@ def share(first, last, modes, ticks, keys, poses, velocity, estimates, alive, ra
             air, world, tick, keys[world], poses[world], alive[world], walls, maps.layers[world], maps.versions[world],
             maps.dirty[world],
         )  # fmt: skip
+        if modes[world] == LAUNCHING:
+            meet(air, world, tick, estimates[world])
         for drone in range(drones):
             for peer in range(drones):
                 x, y, known = peer_place(air.peers[world, drone, peer], tick, air.rules)
