@@ -1,7 +1,7 @@
 """A spinning LiDAR's scan, put right: each beam where the end of the turn would have seen what it met.
 
-Beams come one after another, and a scan is stamped at the end of its turn: beam i of n was taken (1 − i / n) of the turn
-before the stamp. A sensor that sees part of a turn takes its beams in that part of the period.
+Beams come one after another, and a scan is stamped at the end of its turn: beam i of n was taken (1 − i / n) of the
+turn before the stamp. A sensor that sees part of a turn takes its beams in that part of the period.
 """
 
 from __future__ import annotations
