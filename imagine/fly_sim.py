@@ -7,12 +7,14 @@ a vehicle in the field.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from imagine.core.errors import ImagineError, InputError, WorkError
+from imagine.core.frames import Pose
 from imagine.first_start import compile_kernels, warm_twin
 from imagine.flight_ground import FlightGround
 from imagine.flight_results import FlightLog, results
@@ -83,7 +85,7 @@ def fly_sim(options: FlyOptions, processes: RunnerProcesses, watcher: Watcher, b
         twin = Twin(
             [level], options.drones, seed=options.seed, dynamics=options.twin.dynamics, sensing=options.twin.sensing
         )
-        settings = _drone_settings(options, level.launch_poses(options.drones))
+        settings = drone_settings(options, level.launch_poses(options.drones))
         load_policy(settings[0])  # refuses a model that does not fit
         ground: FlightGround | None = None
         if not options.headless:
@@ -187,7 +189,8 @@ def _moves(record: TickRecord) -> bool:
     return lifted or bool(abs(record.velocities[:, :2]).max() > _MOTION_MPS)
 
 
-def _drone_settings(options: FlyOptions, poses: list[Any]) -> list[DroneSettings]:
+def drone_settings(options: FlyOptions, poses: Sequence[Pose]) -> list[DroneSettings]:
+    """Return what each drone of the flight is given, from number 1 on, before it is wired."""
     radio = MeshSettings(protocol=options.protocol)
     odometry = OdometrySettings(deskew=options.twin.sensing.skew)
     return [
