@@ -18,6 +18,7 @@ from imagine.core.observation import MOTION, fill_motion, fill_sectors, fill_vie
 from imagine.core.shield import shield_kernel
 from imagine.sim.air_receive import deliver, meet, peer_place
 from imagine.sim.air_send import send
+from imagine.sim.odometry_drift import advance_worlds
 from imagine.sim.physics import step_worlds
 from imagine.sim.scan_world import scan_world
 from imagine.sim.team_maps import integrate_scans
@@ -67,6 +68,15 @@ def fly(first, last, modes, intents, setpoints, ranges, estimates, alive, specs,
                 )
             setpoints[world, drone, 0], setpoints[world, drone, 1], setpoints[world, drone, 2] = vx, vy, rate
         step_worlds(world, world + 1, setpoints, *flight)
+
+
+@numba.njit(cache=True, nogil=True)
+def locate(first, last, modes, estimates, poses, drift):  # type: ignore[no-untyped-def]
+    """Carry what drones take their `poses` to be on by a tick; `drift` is `OdometryDrift.kernel_args()`."""
+    error, before, scale, drawn, ages, numbers, normal = drift
+    for world in range(first, last):
+        if modes[world] != WAITING:
+            advance_worlds(world, world + 1, estimates, poses, error, before, scale, drawn, ages, numbers, normal)
 
 
 @numba.njit(cache=True, nogil=True)
