@@ -197,6 +197,7 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
         old = np.int64(costs[cell])
         if 0 <= old < FAR:
             entry_cell[entries], entry_next[entries], heads[old] = cell, heads[old], entries
+            is_dirty[cell] |= np.uint8(2)
             entries += 1
             lowest = min(lowest, old)
     count = _drop_unsupported(costs, flat_kinds, np.uint32(width), lowest, entries, dirty, count, is_dirty, scratch)
@@ -253,7 +254,8 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
 ):
     """Set to FAR, from the queued cells on, what no neighbour's cost explains any more; note it, return the count.
 
-    Cells come by their old cost, so that what may support a cell has been looked at before it.
+    Cells come by their old cost, so that what may support a cell has been looked at before it; each comes once, which
+    the second bit of `is_dirty` sees to.
     """
     heads, entry_cell, entry_next = scratch
     found, at = np.empty(9, np.uint32), np.empty(9, np.int64)
@@ -265,8 +267,6 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
             heads[level] = entry_next[entry]
             queued -= 1
             cell = np.uint32(entry_cell[entry])
-            if costs[cell] != level:
-                continue  # it came twice, and was dropped the first time
             kind = kinds[cell]
             if level == 0:
                 if kind & np.uint8(_FRONTIER):
@@ -274,36 +274,47 @@ def _drop_unsupported(  # type: ignore[no-untyped-def]
             elif _least(costs, kinds, cell, width) <= level:
                 continue
             costs[cell] = FAR
-            if is_dirty[cell] == 0:
-                is_dirty[cell] = 1
+            if not is_dirty[cell] & np.uint8(1):
+                is_dirty[cell] |= np.uint8(1)
                 dirty[count] = cell
                 count += 1
             # What may have come this way is looked at next; corners do not matter, it can only prove supported.
             e, w, n, s = np.uint32(cell + one), np.uint32(cell - one), np.uint32(cell + width), np.uint32(cell - width)
             ne, nw, se, sw = np.uint32(n + one), np.uint32(n - one), np.uint32(s + one), np.uint32(s - one)
             ways = np.uint64(0)
-            found[ways], at[ways] = e, _onward(level, kind | kinds[e], _STRAIGHT)
-            ways += np.uint64(at[ways] == costs[e])
-            found[ways], at[ways] = w, _onward(level, kind | kinds[w], _STRAIGHT)
-            ways += np.uint64(at[ways] == costs[w])
-            found[ways], at[ways] = n, _onward(level, kind | kinds[n], _STRAIGHT)
-            ways += np.uint64(at[ways] == costs[n])
-            found[ways], at[ways] = s, _onward(level, kind | kinds[s], _STRAIGHT)
-            ways += np.uint64(at[ways] == costs[s])
-            found[ways], at[ways] = ne, _onward(level, kind | kinds[ne], _DIAGONAL)
-            ways += np.uint64(at[ways] == costs[ne])
-            found[ways], at[ways] = nw, _onward(level, kind | kinds[nw], _DIAGONAL)
-            ways += np.uint64(at[ways] == costs[nw])
-            found[ways], at[ways] = se, _onward(level, kind | kinds[se], _DIAGONAL)
-            ways += np.uint64(at[ways] == costs[se])
-            found[ways], at[ways] = sw, _onward(level, kind | kinds[sw], _DIAGONAL)
-            ways += np.uint64(at[ways] == costs[sw])
+            reached = _onward(level, kind | kinds[e], _STRAIGHT)
+            found[ways], at[ways] = e, reached
+            ways += np.uint64((reached == costs[e]) & (is_dirty[e] < 2))
+            reached = _onward(level, kind | kinds[w], _STRAIGHT)
+            found[ways], at[ways] = w, reached
+            ways += np.uint64((reached == costs[w]) & (is_dirty[w] < 2))
+            reached = _onward(level, kind | kinds[n], _STRAIGHT)
+            found[ways], at[ways] = n, reached
+            ways += np.uint64((reached == costs[n]) & (is_dirty[n] < 2))
+            reached = _onward(level, kind | kinds[s], _STRAIGHT)
+            found[ways], at[ways] = s, reached
+            ways += np.uint64((reached == costs[s]) & (is_dirty[s] < 2))
+            reached = _onward(level, kind | kinds[ne], _DIAGONAL)
+            found[ways], at[ways] = ne, reached
+            ways += np.uint64((reached == costs[ne]) & (is_dirty[ne] < 2))
+            reached = _onward(level, kind | kinds[nw], _DIAGONAL)
+            found[ways], at[ways] = nw, reached
+            ways += np.uint64((reached == costs[nw]) & (is_dirty[nw] < 2))
+            reached = _onward(level, kind | kinds[se], _DIAGONAL)
+            found[ways], at[ways] = se, reached
+            ways += np.uint64((reached == costs[se]) & (is_dirty[se] < 2))
+            reached = _onward(level, kind | kinds[sw], _DIAGONAL)
+            found[ways], at[ways] = sw, reached
+            ways += np.uint64((reached == costs[sw]) & (is_dirty[sw] < 2))
             for k in range(ways):
                 target = at[k]
                 entry_cell[entries], entry_next[entries], heads[target] = found[k], heads[target], entries
+                is_dirty[found[k]] |= np.uint8(2)
                 entries += 1
                 queued += 1
         level += 1
+    for k in range(entries):
+        is_dirty[entry_cell[k]] &= np.uint8(1)
     return count
 
 
@@ -336,22 +347,30 @@ def _settle(costs, kinds, width, level, queued, scratch):  # type: ignore[no-unt
             ne, nw, se, sw = np.uint32(n + one), np.uint32(n - one), np.uint32(s + one), np.uint32(s - one)
             ways = np.uint64(0)
             # BLOCKED is below all; a diagonal step cuts no corner: both cells beside it must be free
-            found[ways], at[ways] = e, _onward(level, kind | kinds[e], _STRAIGHT)
-            ways += np.uint64(at[ways] < costs[e])
-            found[ways], at[ways] = w, _onward(level, kind | kinds[w], _STRAIGHT)
-            ways += np.uint64(at[ways] < costs[w])
-            found[ways], at[ways] = n, _onward(level, kind | kinds[n], _STRAIGHT)
-            ways += np.uint64(at[ways] < costs[n])
-            found[ways], at[ways] = s, _onward(level, kind | kinds[s], _STRAIGHT)
-            ways += np.uint64(at[ways] < costs[s])
-            found[ways], at[ways] = ne, _onward(level, kind | kinds[ne], _DIAGONAL)
-            ways += np.uint64((at[ways] < costs[ne]) & (costs[n] >= 0) & (costs[e] >= 0))
-            found[ways], at[ways] = nw, _onward(level, kind | kinds[nw], _DIAGONAL)
-            ways += np.uint64((at[ways] < costs[nw]) & (costs[n] >= 0) & (costs[w] >= 0))
-            found[ways], at[ways] = se, _onward(level, kind | kinds[se], _DIAGONAL)
-            ways += np.uint64((at[ways] < costs[se]) & (costs[s] >= 0) & (costs[e] >= 0))
-            found[ways], at[ways] = sw, _onward(level, kind | kinds[sw], _DIAGONAL)
-            ways += np.uint64((at[ways] < costs[sw]) & (costs[s] >= 0) & (costs[w] >= 0))
+            reached = _onward(level, kind | kinds[e], _STRAIGHT)
+            found[ways], at[ways] = e, reached
+            ways += np.uint64(reached < costs[e])
+            reached = _onward(level, kind | kinds[w], _STRAIGHT)
+            found[ways], at[ways] = w, reached
+            ways += np.uint64(reached < costs[w])
+            reached = _onward(level, kind | kinds[n], _STRAIGHT)
+            found[ways], at[ways] = n, reached
+            ways += np.uint64(reached < costs[n])
+            reached = _onward(level, kind | kinds[s], _STRAIGHT)
+            found[ways], at[ways] = s, reached
+            ways += np.uint64(reached < costs[s])
+            reached = _onward(level, kind | kinds[ne], _DIAGONAL)
+            found[ways], at[ways] = ne, reached
+            ways += np.uint64((reached < costs[ne]) & (costs[n] >= 0) & (costs[e] >= 0))
+            reached = _onward(level, kind | kinds[nw], _DIAGONAL)
+            found[ways], at[ways] = nw, reached
+            ways += np.uint64((reached < costs[nw]) & (costs[n] >= 0) & (costs[w] >= 0))
+            reached = _onward(level, kind | kinds[se], _DIAGONAL)
+            found[ways], at[ways] = se, reached
+            ways += np.uint64((reached < costs[se]) & (costs[s] >= 0) & (costs[e] >= 0))
+            reached = _onward(level, kind | kinds[sw], _DIAGONAL)
+            found[ways], at[ways] = sw, reached
+            ways += np.uint64((reached < costs[sw]) & (costs[s] >= 0) & (costs[w] >= 0))
             for k in range(ways):
                 other, reached = found[k], at[k]
                 costs[other] = reached

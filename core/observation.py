@@ -61,8 +61,10 @@ def _fill_aligned(  # type: ignore[no-untyped-def]
     count = max(0, min(n, (columns - column) // block) - first)  # pixels within the grid, of which both are multiples
     last_row = min(n, (rows - row) // block)
     out, near = occupancy.ravel(), frontier.ravel()
-    out[:] = 0.0
-    near[:] = 1.0
+    if count < n or last_row - first_row < n:
+        out[:] = 0.0
+    if count < n or last_row - first_row < n or own >= FAR:
+        near[:] = 1.0
     if count == 0 or last_row <= first_row:
         return
     begin = column + first * block
@@ -210,7 +212,11 @@ def fill_sectors(sectors, ranges, range_min, start, increment, turn, range_m):  
         if not r >= range_min:
             continue
         bearing = start + beam * increment + turn
-        sector = math.floor(bearing / (2.0 * math.pi) * count) % count
+        sector = math.floor(bearing / (2.0 * math.pi) * count)
+        while sector < 0:  # at most a turn or two, and far cheaper than a division
+            sector += count
+        while sector >= count:
+            sector -= count
         sectors[sector] = min(sectors[sector], np.float32(min(r / range_m, 1.0)))
 
 

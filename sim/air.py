@@ -47,30 +47,33 @@ def _record(**fields: type) -> np.dtype[np.void]:
 _INT, _FLOAT = np.int64, np.float64
 NODE = _record(
     tokens=_FLOAT, busy_until=_FLOAT, next_status=_FLOAT, next_digest=_FLOAT, next_scan=_FLOAT, next_plan=_FLOAT,
-    scan_clock=_INT, pending_clock=_INT, pending_bytes=_INT, claimed_clock=_INT, sequence=_INT, dropped=_INT,
-    wanted=_INT, digest_unit=_INT, digest_units=_INT, digest_parts=_INT,
-    first_message=_INT, messages=_INT, first_scan=_INT, scans=_INT,
+    scan_clock=_INT, pending_clock=_INT, pending_bytes=_INT, pending_slot=_INT, canvas=_INT, sequence=_INT,
+    dropped=_INT, wanted=_INT, digest_unit=_INT, digest_units=_INT, digest_parts=_INT,
+    first_message=_INT, messages=_INT, busy_slots=_INT, scans=_INT,
     first_tile=_INT, tiles=_INT, first_digest=_INT, digests=_INT, tiles_first=np.bool_,
 )  # fmt: skip
-"""What a drone's mesh node keeps: `tokens` bytes left to send, `busy_until` and `next_...` seconds, `pending_clock` that
-of a scan that waits to be sent (0 for none); `wanted` tiles are queued; rings have a first and a count. `dropped`
-messages found the radio's queue full."""
+"""What a drone's mesh node keeps: `tokens` bytes left to send, `busy_until` and `next_...` seconds, `pending_...` of a
+scan that waits to be sent (clock 0 for none); `canvas` the slot of scans that the next one is drawn in; `busy_slots` a
+bit for each slot in flight; `wanted` tiles are queued; rings have a first and a count. `dropped` messages found the
+radio's queue full."""
 PEER = _record(
-    heard_tick=_INT, pose_tick=_INT, digest_tick=_INT, hears=_INT,
+    heard_tick=_INT, pose_tick=_INT, status_tick=_INT, digest_tick=_INT, hears=_INT,
     x=_FLOAT, y=_FLOAT, yaw=_FLOAT, vx=_FLOAT, vy=_FLOAT,
 )  # fmt: skip
-"""What a drone knows of another: when it heard it, its pose, its digest (NEVER before the first), whom it hears (a bit
-for each drone), and pose and velocity as last told."""
+"""What a drone knows of another: when it heard it, its pose, its status, its digest (NEVER before the first), whom it
+hears (a bit for each drone), and pose and velocity as last told."""
 LINK = _record(delivered=_INT, delivered_bytes=_INT, lost=_INT, lost_bytes=_INT, out_of_range=_INT, ticks=_INT)
 """What became of the messages from one drone to another, and for how many ticks the two were in reach."""
 MESSAGE = _record(
     arrival=_FLOAT, x=_FLOAT, y=_FLOAT, yaw=_FLOAT, vx=_FLOAT, vy=_FLOAT, sequence=_INT, hears=_INT,
-    kind=np.int32, size=np.int32, source=np.int32, count=np.int32, first_unit=np.int32, last_unit=np.int32,
+    kind=np.int32, size=np.int32, slot=np.int32, source=np.int32, count=np.int32,
+    first_unit=np.int32, last_unit=np.int32,
 )  # fmt: skip
-"""A message in flight. `source` and `count` belong to tiles, the units to digests, `hears` and velocity to statuses."""
-WINDOW = _record(row=_INT, column=_INT, middle=_INT, clock=_INT, x=_FLOAT, y=_FLOAT, yaw=_FLOAT)
+"""A message in flight. `slot` belongs to scans, `source` and `count` to tiles, the units to digests, `hears` and the
+velocity to statuses."""
+WINDOW = _record(row=_INT, column=_INT, clock=_INT, x=_FLOAT, y=_FLOAT, yaw=_FLOAT)
 """A scan in flight: the grid's row and column of its first mark (a whole number of tiles; both may lie off the grid),
-the drone's column, the sender's clock after the scan, and its pose."""
+the sender's clock after the scan, and its pose."""
 TILE_NOTE = _record(
     sent_version=np.uint32, sent_tick=np.int32, cost_version=np.uint32, cost=np.int16, provisional=np.uint8
 )
@@ -104,12 +107,12 @@ class AirState(NamedTuple):
     """All arrays of the air, for kernels to take whole; `[worlds, drones, ...]`.
 
     For others to read: `reach` uint8 `[..., drones]`, who hears whom this tick; `links` LINK and `peers` PEER
-    `[..., drones]`; `counters` int64 `[..., 11]`. The rest: `nodes` NODE; rings of `messages` MESSAGE, of scans
-    (`windows` WINDOW, `marks` int8 `[..., rows, columns]`), of tiles (`tile_cells` int8, `tile_keys` place and version)
-    and of digests (uint32 `[..., source, tile]`); `holdings` uint32 `[..., peer, source, tile]` the versions that
-    peers are known to hold; `notes` TILE_NOTE `[..., source, tile]`; `wanted` int64 the queue of tiles; `known` int8
-    `[..., row, column]` the cells that ever had evidence; `confirmed` int8 `[..., source, row, column]` the cells of
-    tiles as their source sent them, kept only for passing on.
+    `[..., drones]`; `counters` int64 `[..., 11]`. The rest: `nodes` NODE; `messages` MESSAGE, a ring; slots of scans,
+    with `windows` WINDOW, `marks` int8 `[..., rows, columns]` and the `spans` of rows that hold any; rings of tiles
+    (`tile_cells` int8, `tile_keys` place and version) and of digests (uint32 `[..., source, tile]`); `holdings` uint32
+    `[..., peer, source, tile]` the versions that peers are known to hold; `notes` TILE_NOTE `[..., source, tile]`;
+    `wanted` int64 the queue of tiles; `known` int8 `[..., row, column]` the cells that ever had evidence; `confirmed`
+    int8 `[..., source, row, column]` the cells of tiles as their source sent them, kept only for passing on.
     """
 
     rules: AirRules
@@ -121,6 +124,7 @@ class AirState(NamedTuple):
     messages: NDArray[np.void]
     windows: NDArray[np.void]
     marks: NDArray[np.int8]
+    spans: NDArray[np.int16]
     tile_cells: NDArray[np.int8]
     tile_keys: NDArray[np.int64]
     digests: NDArray[np.uint32]
@@ -162,10 +166,11 @@ class Air:
         for name, array in self.state._asdict().items():
             if name != "rules":
                 array[world] = np.zeros((), array.dtype)  # a zero of any kind, records among them
-        for never in ("heard_tick", "pose_tick", "digest_tick"):
+        for never in ("heard_tick", "pose_tick", "status_tick", "digest_tick"):
             self.state.peers[world][never] = NEVER
         self.state.notes[world]["sent_tick"] = NEVER
         nodes = self.state.nodes[world]
+        nodes["canvas"] = nodes["pending_slot"] = -1
         nodes["tokens"] = self.rules.burst
         for name in ("next_status", "next_digest", "next_scan", "next_plan"):
             nodes[name] = -np.inf
@@ -184,7 +189,7 @@ class Air:
     def cells_known(self) -> NDArray[np.int64]:
         """Cells first known by own scans, peers' scans and tiles, `[worlds, drones, 3]`.
 
-        Own ones are counted only up to when the drone last heard of others' maps: see `air_receive.claim_all`.
+        Own ones are counted where others' evidence comes in; `air_receive.claim_own` counts the rest.
         """
         return self.state.counters[..., CELLS_KNOWN : CELLS_KNOWN + 3]
 
@@ -193,7 +198,7 @@ class Air:
         """Memory of one drone of one world."""
         arrays = [array for name, array in self.state._asdict().items() if name != "rules"]
         worlds, drones = self.state.nodes.shape
-        return math.ceil(sum(array.nbytes for array in arrays) / (worlds * drones))
+        return math.ceil(sum(int(array.nbytes) for array in arrays) / int(worlds * drones))
 
 
 def _rules(radio: RadioSettings, mesh: MeshSettings, lidar: LidarSpec, range_cap_m: float, tick_s: float) -> AirRules:
@@ -241,6 +246,7 @@ def _allocate(worlds: int, drones: int, tile_rows: int, tile_columns: int, rules
         messages=np.zeros((*per_drone, _MOST_MESSAGES), MESSAGE),
         windows=np.zeros((*per_drone, scans), WINDOW),
         marks=np.zeros((*per_drone, scans, side, blocks * TILE), np.int8),
+        spans=np.zeros((*per_drone, scans, blocks, 2), np.int16),
         tile_cells=np.zeros((*per_drone, _MOST_TILES if exchanges else 1, TILE, TILE), np.int8),
         tile_keys=np.zeros((*per_drone, _MOST_TILES if exchanges else 1, 2), np.int64),
         digests=np.zeros((*per_drone, digests, drones, tiles), np.uint32),

@@ -16,7 +16,7 @@ from imagine.mesh_comm.messages import MAX_DATAGRAM
 from imagine.mesh_comm.seal import OVERHEAD
 
 SCAN_WEIGHTS = (49.51, 0.580, 0.831, 2.496)
-"""Bytes of a packed scan: in all, and per beam whose code differs from the beam before, by 8 or more, by 128 or more."""
+"""Bytes of a packed scan: in all, and per beam whose code differs from that before, by 8 or more, by 128 or more."""
 TILE_WEIGHTS = (31.00, 0.027, 0.847, 1.232)
 """Bytes of a packed tile: in all, and per change along a row, per change that the row above has not, per new row."""
 VERSIONS_WEIGHTS = (23.13, 2.452)
@@ -80,11 +80,11 @@ def tile_features(cells, row0, column0):  # type: ignore[no-untyped-def]
 
     Changes along rows, those of them that the row above has not, and rows that differ from the row above.
     """
-    changes = news = rows = 0
+    changes, news, rows = np.int64(0), np.int64(0), np.int64(0)
     for i in range(TILE):
         row = np.uintp(row0 + i)
         above = np.uintp(row0 + i - 1) if i > 0 else row
-        row_changes = row_news = differs = np.int8(0)
+        row_changes, row_news, differs = np.int8(0), np.int8(0), np.int8(0)
         for j in range(1, TILE):
             here, left = np.uintp(column0 + j), np.uintp(column0 + j - 1)
             value, before = cells[row, here], cells[row, left]
@@ -94,9 +94,9 @@ def tile_features(cells, row0, column0):  # type: ignore[no-untyped-def]
             row_changes = np.int8(row_changes + changed)
             row_news = np.int8(row_news + np.int8(changed & other))
             differs = np.int8(differs | other)
-        changes += row_changes
-        news += row_news if i > 0 else row_changes
-        rows += differs
+        changes += np.int64(row_changes)
+        news += np.int64(row_news if i > 0 else row_changes)
+        rows += np.int64(differs)
     return changes, news, rows
 
 
@@ -116,12 +116,17 @@ def packed_versions_bytes(tiles):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def scan_bytes(ranges, range_min, range_cap, clock):  # type: ignore[no-untyped-def]
-    """Estimate the sealed bytes of a scan message with these ranges and this map clock; it always fits a datagram."""
+def packed_ranges_bytes(ranges, range_min, range_cap):  # type: ignore[no-untyped-def]
+    """Estimate the bytes of `codec.pack_ranges`."""
     differing, far, jumps = scan_features(ranges, range_min, range_cap)
     base, per_differing, per_far, per_jump = SCAN_WEIGHTS
-    packed = base + per_differing * differing + per_far * far + per_jump * jumps
-    return min(_SCAN_BYTES + int_bytes(clock) + blob_bytes(int(packed + 0.5)), MAX_DATAGRAM)
+    return int(base + per_differing * differing + per_far * far + per_jump * jumps + 0.5)
+
+
+@numba.njit(cache=True, nogil=True)
+def scan_message_bytes(packed, clock):  # type: ignore[no-untyped-def]
+    """Return the sealed bytes of a scan with so many bytes of packed ranges; beams are thinned until it fits."""
+    return min(_SCAN_BYTES + int_bytes(clock) + blob_bytes(packed), MAX_DATAGRAM)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -28,8 +28,7 @@ class Samples:
 
     def fit(self) -> NDArray[np.float64]:
         """Return the weights of least squares, one per feature."""
-        weights: NDArray[np.float64] = np.linalg.lstsq(self.features, self.packed_bytes, rcond=None)[0]
-        return weights
+        return np.asarray(np.linalg.lstsq(self.features, self.packed_bytes, rcond=None)[0], np.float64)
 
     def estimated_bytes(self, weights: Iterable[float]) -> NDArray[np.float64]:
         """Return what `weights` make of the features, `[n]`."""
@@ -74,10 +73,9 @@ def main() -> None:
     for name, samples in collect(fly()).items():
         weights = samples.fit()
         error = samples.estimated_bytes(weights) - samples.packed_bytes
-        print(
-            f"{name:9} weights ({', '.join(f'{weight:.3f}' for weight in weights)})  "
-            f"{len(error)} messages of {samples.packed_bytes.mean():.0f} bytes, rms error {np.sqrt((error**2).mean()):.0f}"
-        )
+        rms, mean = np.sqrt((error**2).mean()), samples.packed_bytes.mean()
+        listed = ", ".join(f"{weight:.3f}" for weight in weights)
+        print(f"{name:9} weights ({listed})  {len(error)} messages of {mean:.0f} bytes, rms error {rms:.0f}")
     print(f"for a range cap of {RANGE_CAP_M:g} m")
 
 

@@ -6,14 +6,12 @@ the arrays they need and not the whole state: handing that on costs more than mo
 
 from __future__ import annotations
 
-import math
-
 import numba
 import numpy as np
 
 from imagine.core.raster import TILE
 from imagine.sim.air import DIGEST, OWN_SCAN, PEER_SCAN, PEER_TILE, SCAN, STATUS, TILES, UNIT_TILES
-from imagine.sim.air_tiles import claim_tile, copy_tile, draw_marks
+from imagine.sim.air_tiles import claim, copy_tile, draw_marks
 from imagine.sim.propagation import fill_reach
 
 _EXTRAPOLATE_S = 1.0  # as in mesh_comm.peers
@@ -70,21 +68,17 @@ def deliver(air, world, tick, key, poses, alive, segments, layers, versions, dir
                     _take_digest(air.holdings[world, receiver, sender], air.digests[world, sender, node.first_digest],
                                  sender, message)  # fmt: skip
                 elif rules.shares and (message.kind == SCAN or message.kind == TILES):
-                    claim_own(
-                        nodes[receiver], air.counters[world, receiver], air.known[world, receiver],
-                        layers[receiver, receiver], versions[receiver, receiver],
-                    )  # fmt: skip
                     if message.kind == SCAN:
                         _take_scan(
-                            air.windows[world, sender, node.first_scan], air.marks[world, sender, node.first_scan],
-                            air.counters[world, receiver], air.known[world, receiver],
-                            air.notes[world, receiver, sender], layers[receiver, sender], versions[receiver, sender],
-                            dirty[receiver],
+                            air.windows[world, sender, message.slot], air.marks[world, sender, message.slot],
+                            air.spans[world, sender, message.slot], air.counters[world, receiver],
+                            air.known[world, receiver], air.notes[world, receiver, sender], layers[receiver, receiver],
+                            layers[receiver, sender], versions[receiver, sender], dirty[receiver],
                         )  # fmt: skip
                     elif message.source == sender or message.source == receiver or rules.relays:
                         _take_tiles(air, world, tick, sender, receiver, message, layers, versions, dirty)
         if message.kind == SCAN:
-            node.first_scan = (node.first_scan + 1) % air.windows.shape[2]
+            node.busy_slots &= ~(1 << message.slot)
             node.scans -= 1
         elif message.kind == TILES:
             node.first_tile = (node.first_tile + message.count) % air.tile_cells.shape[2]
@@ -114,29 +108,13 @@ def meet(air, world, tick, poses):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def claim_all(air, world, layers, versions):  # type: ignore[no-untyped-def]
-    """Bring the count of cells known by own scans up to date for every drone of a world."""
+def claim_own(air, world, layers):  # type: ignore[no-untyped-def]
+    """Bring the count of cells known by own scans up to date for every drone of a world; before it is read."""
     for drone in range(layers.shape[0]):
-        claim_own(
-            air.nodes[world, drone], air.counters[world, drone], air.known[world, drone],
-            layers[drone, drone], versions[drone, drone],
-        )  # fmt: skip
-
-
-@numba.njit(cache=True, nogil=True)
-def claim_own(node, counters, known, cells, versions):  # type: ignore[no-untyped-def]
-    """Count the cells that a drone's scans have made known first; `cells` and `versions` are its own layer.
-
-    Done before peers' evidence comes in, and only for tiles that have changed since the last time.
-    """
-    newest = node.claimed_clock
-    for i in range(versions.shape[0]):
-        for j in range(versions.shape[1]):
-            version = np.int64(versions[i, j])
-            if version > node.claimed_clock:
-                newest = max(newest, version)
-                counters[OWN_SCAN] += claim_tile(cells, known, i, j)
-    node.claimed_clock = newest
+        for i in range(layers.shape[2] // TILE):
+            for j in range(layers.shape[3] // TILE):
+                own = claim(layers[drone, drone], air.known[world, drone], i * TILE, TILE, j * TILE)
+                air.counters[world, drone, OWN_SCAN] += own
 
 
 @numba.njit(cache=True, nogil=True)
@@ -175,6 +153,7 @@ def _hear(peer, tick, message):  # type: ignore[no-untyped-def]
     """Note that a peer was heard, and where it says it is."""
     peer.heard_tick = tick
     if message.kind == STATUS:
+        peer.status_tick = tick
         peer.hears, peer.vx, peer.vy = message.hears, message.vx, message.vy
     if message.kind == STATUS or message.kind == SCAN:
         peer.pose_tick = tick
@@ -194,36 +173,32 @@ def _take_digest(holdings, digest, sender, message):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, nogil=True)
-def _take_scan(window, marks, counters, known, notes, cells, versions, dirty):  # type: ignore[no-untyped-def]
+def _take_scan(window, marks, spans, counters, known, notes, own_cells, cells, versions, dirty):  # type: ignore[no-untyped-def]
     """Draw a peer's scan into its layer, except on tiles that already contain it; what it changes turns provisional.
 
-    `cells`, `versions` and `notes` are the receiver's of this sender.
+    `cells`, `versions` and `notes` are the receiver's of this sender, `own_cells` its own layer. Where cells get their
+    first evidence, what own scans have made known by now is counted before it.
     """
     tile_rows, tile_columns = versions.shape
-    radius = marks.shape[0] // 2
-    squared = (radius + 1) * (radius + 1)  # a cell's far corner counts, so marks reach a cell further
-    fresh = 0
-    for block in range(marks.shape[1] // TILE):
+    for block in range(spans.shape[0]):
         j = window.column // TILE + block
-        aside = max(0, j * TILE - window.middle, window.middle - (j * TILE + TILE - 1))
-        if j < 0 or j >= tile_columns or aside > radius:
+        if j < 0 or j >= tile_columns:
             continue
-        half = min(radius, int(math.sqrt(squared - aside * aside)))
-        row = max(0, window.row + radius - half)
-        last = min(tile_rows * TILE, window.row + radius + half + 1)
+        row = max(0, window.row + spans[block, 0])
+        last = min(tile_rows * TILE, window.row + spans[block, 1])
         while row < last:
             i = row // TILE
             end = min(last, (i + 1) * TILE)
             if np.int64(versions[i, j]) < window.clock:
-                changed, new = draw_marks(
-                    cells, known, marks, row, end - row, j * TILE, row - window.row, block * TILE
-                )  # fmt: skip
-                fresh += new
-                if changed:
+                mark_row, mark_column = row - window.row, block * TILE
+                changed, first = draw_marks(cells, marks, row, end - row, j * TILE, mark_row, mark_column)
+                if first > 0:
+                    counters[OWN_SCAN] += claim(own_cells, known, row, end - row, j * TILE)
+                    counters[PEER_SCAN] += claim(cells, known, row, end - row, j * TILE)
+                if changed > 0:
                     notes[i * tile_columns + j].provisional = 1
                     dirty[i, j] = 1
             row = end
-    counters[PEER_SCAN] += fresh
 
 
 @numba.njit(cache=True, nogil=True)
@@ -235,7 +210,7 @@ def _take_tiles(air, world, tick, sender, receiver, message, layers, versions, d
     keeps_drawn = source != sender and not is_own and is_live(air.peers[world, receiver, source], tick, air.rules)
     held_by_sender, notes = air.holdings[world, receiver, sender, source], air.notes[world, receiver, source]
     cells, held, known = layers[receiver, source], versions[receiver, source], air.known[world, receiver]
-    fresh = 0
+    own_cells, counters = layers[receiver, receiver], air.counters[world, receiver]
     for k in range(message.count):
         slot = (air.nodes[world, sender].first_tile + k) % slots
         tile, version = air.tile_keys[world, sender, slot, 0], np.uint32(air.tile_keys[world, sender, slot, 1])
@@ -249,9 +224,9 @@ def _take_tiles(air, world, tick, sender, receiver, message, layers, versions, d
             held[i, j] = version
             note.provisional = 0
             dirty[receiver, i, j] = 1
-            fresh += claim_tile(cells, known, i, j)
+            counters[OWN_SCAN] += claim(own_cells, known, i * TILE, TILE, j * TILE)
+            counters[PEER_TILE] += claim(cells, known, i * TILE, TILE, j * TILE)
         held_by_sender[tile] = max(held_by_sender[tile], version)
         if not is_own and held[i, j] <= version:
             # those in reach have it from the sender: no need to pass it on at once
             note.sent_version, note.sent_tick = version, tick
-    air.counters[world, receiver, PEER_TILE] += fresh

@@ -16,8 +16,6 @@ from imagine.sim.air import (
     BYTES_SENT,
     DIGEST,
     MESSAGES_SENT,
-    MOST_WANTED,
-    NEVER,
     SCAN,
     STATUS,
     TILES,
@@ -25,38 +23,59 @@ from imagine.sim.air import (
 )
 from imagine.sim.air_costs import (
     digest_message_bytes,
+    packed_ranges_bytes,
     packed_tile_bytes,
     packed_versions_bytes,
-    scan_bytes,
+    scan_message_bytes,
     status_bytes,
     tile_in_message_bytes,
     tiles_message_bytes,
 )
+from imagine.sim.air_plan import plan, source_and_tile
 from imagine.sim.air_receive import is_live
-from imagine.sim.air_tiles import align_marks, copy_tile
+from imagine.sim.air_tiles import copy_tile, find_spans
 
 # these are those of mesh_comm.node, tile_exchange and digest
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4
-_DIGEST_GRACE_S = 0.25
 _EPSILON_S = 1e-6
 _MAX_PAYLOAD = MAX_DATAGRAM - OVERHEAD
 _RESERVED_TILE, _RESERVED_TILES = 16, 10
 _RESERVED_HOLDING, _RESERVED_DIGEST = 24, 24
 _MOST_TILES = 256
 
-_ROWS, _PLACES, _SOURCES, _STALE, _MISSING = 1 << 12, 1 << 24, 1 << 6, 1 << 24, 1 << 6  # digits of a queue entry
+
+@numba.njit(cache=True, nogil=True)
+def canvas(air, world, drone, row, column):  # type: ignore[no-untyped-def]
+    """Return (slot, first row, first column): where the next scan of `drone`, in cell (row, column), is to be drawn.
+
+    The marks are `air.marks[world, drone, slot]` (int8 `[side, side or more]`), with an older scan to be painted over:
+    -1 for a miss, +2 for a hit, 0 untouched. Their first cell is (first row, first column) of the grid; both may lie
+    off it, and so may cells. With `side` = 2 n + 1, n the range cap in cells, rounded up, plus 1, the drone's cell is
+    in the middle row, and the columns reach n to both sides. `send` takes the marks from there; what is drawn is kept
+    until it has arrived.
+    """
+    node = air.nodes[world, drone]
+    taken = node.busy_slots
+    if node.pending_slot >= 0:
+        taken |= 1 << node.pending_slot
+    slot = 0
+    while (taken >> slot) & 1 == 1:
+        slot += 1
+    node.canvas = slot
+    marks, window = air.marks[world, drone, slot], air.windows[world, drone, slot]
+    reach = marks.shape[0] // 2
+    window.row, window.column = row - reach, (column - reach) // TILE * TILE
+    return slot, window.row, window.column
 
 
 @numba.njit(cache=True, nogil=True)
-def send(air, world, tick, poses, velocity, alive, ranges, marks, mark_corner, clocks, layers, versions):  # type: ignore[no-untyped-def]
-    """Let every drone of `world` that is `alive` say at `tick` what it has to say; call it when own scans have been integrated.
+def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versions):  # type: ignore[no-untyped-def]
+    """Let every drone of `world` that is `alive` say at `tick` what it has to say; call it once own scans are mapped.
 
     `poses` `[drones, 3]` and `velocity` `[drones, 2 or more]` in the map frame; `ranges` float32 `[drones, beams]` as
-    they were mapped; `marks` int8 `[drones, side, side]` the evidence of each drone's scan around its cell, the first
-    of it at `mark_corner` (`[drones, 2]`: row and column of the grid, negative where it starts outside), with `side`
-    twice the range cap in cells, rounded up, plus 3; `clocks` `[drones]` the own layers' clocks. `layers` and
-    `versions` as in `deliver`.
+    they were mapped, their marks drawn on each drone's `canvas`; `clocks` `[drones]` the own layers' clocks. `layers`
+    and `versions` as in `deliver`.
     """
     rules = air.rules
     now = tick / rules.ticks_per_s
@@ -71,14 +90,17 @@ def send(air, world, tick, poses, velocity, alive, ranges, marks, mark_corner, c
             if is_live(peers[drone, peer], tick, rules):
                 live |= 1 << peer
         shares = live != 0 and rules.shares
-        can_offer = shares and now >= node.next_scan - _EPSILON_S and node.scans < air.windows.shape[2]
-        if can_offer and np.int64(clocks[drone]) != node.scan_clock:
-            slot = (node.first_scan + node.scans) % air.windows.shape[2]
-            _keep_scan(
-                node, air.windows[world, drone, slot], air.marks[world, drone, slot], poses[drone], marks[drone],
-                mark_corner[drone], clocks[drone],
-            )  # fmt: skip
-            node.pending_bytes = scan_bytes(ranges[drone], rules.range_min, rules.range_cap, node.pending_clock)
+        can_offer = node.canvas >= 0 and now >= node.next_scan - _EPSILON_S and node.scans < air.windows.shape[2] - 1
+        if shares and can_offer and np.int64(clocks[drone]) != node.scan_clock:
+            # it replaces one that still waits; a slot stays free for the next canvas
+            node.pending_slot, node.pending_clock = node.canvas, np.int64(clocks[drone])
+            packed = packed_ranges_bytes(ranges[drone], rules.range_min, rules.range_cap)
+            node.pending_bytes = scan_message_bytes(packed, node.pending_clock)
+            window = air.windows[world, drone, node.pending_slot]
+            window.clock = node.pending_clock
+            window.x, window.y, window.yaw = poses[drone, 0], poses[drone, 1], poses[drone, 2]
+            find_spans(air.marks[world, drone, node.pending_slot], air.spans[world, drone, node.pending_slot])
+        node.canvas = -1
         if shares and now >= node.next_digest - _EPSILON_S:
             node.next_digest = now + rules.digest_period
             node.digest_units = layers.shape[1] * _units(versions.shape[2] * versions.shape[3])
@@ -87,7 +109,7 @@ def send(air, world, tick, poses, velocity, alive, ranges, marks, mark_corner, c
             node.next_plan = now + _PLAN_PERIOD_S
             node.wanted = 0
             if shares:
-                _plan(air, world, tick, drone, live, versions)
+                plan(air, world, tick, drone, live, versions)
         if now >= node.next_status - _EPSILON_S:
             said = _send_status(
                 rules, now, node, messages[drone], counters[drone], peers[drone], poses[drone], velocity[drone], live
@@ -205,16 +227,6 @@ def _send_digests(rules, now, drone, node, messages, counters, digests, versions
 
 
 @numba.njit(cache=True, nogil=True)
-def _keep_scan(node, window, aligned, pose, marks, mark_corner, clock):  # type: ignore[no-untyped-def]
-    """Keep the marks of a scan that changed the map, for sending; it replaces one that still waits."""
-    window.row, window.column = mark_corner[0], mark_corner[1] // TILE * TILE
-    window.middle = mark_corner[1] + marks.shape[1] // 2
-    window.x, window.y, window.yaw = pose[0], pose[1], pose[2]
-    window.clock = node.pending_clock = np.int64(clock)
-    align_marks(marks, aligned, mark_corner[1] - window.column)
-
-
-@numba.njit(cache=True, nogil=True)
 def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[no-untyped-def]
     """Send the scan that waits, if any; False when bytes run short."""
     if node.pending_clock == 0:
@@ -223,78 +235,13 @@ def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[n
         return False
     place = _transmit(rules, now, node, messages, counters, SCAN, node.pending_bytes)
     if place >= 0:
-        window = windows[(node.first_scan + node.scans) % windows.shape[0]]
-        messages[place].x, messages[place].y, messages[place].yaw = window.x, window.y, window.yaw
+        message, window = messages[place], windows[node.pending_slot]
+        message.x, message.y, message.yaw, message.slot = window.x, window.y, window.yaw, node.pending_slot
+        node.busy_slots |= 1 << node.pending_slot
         node.scans += 1
-    node.scan_clock, node.pending_clock = node.pending_clock, 0
+    node.scan_clock, node.pending_clock, node.pending_slot = node.pending_clock, 0, -1
     node.next_scan = now + rules.scan_period
     return True
-
-
-@numba.njit(cache=True, nogil=True)
-def _plan(air, world, tick, drone, live, versions):  # type: ignore[no-untyped-def]
-    """Queue the tiles that some peer in touch, by its last digest, lacks: most lacking first, then most outdated.
-
-    A queue entry is its rank and place in one number, least first.
-    """
-    rules, node, peers = air.rules, air.nodes[world, drone], air.peers[world, drone]
-    rate, drones, tile_columns = rules.ticks_per_s, versions.shape[1], versions.shape[3]
-    now = tick / rate
-    wanted, holdings = air.wanted[world, drone], air.holdings[world, drone]
-    readers = 0  # a bit for each peer in touch that has told what it holds
-    for peer in range(drones):
-        if peers[peer].digest_tick >= 0:
-            readers |= live & 1 << peer
-    for source in range(drones):
-        if readers == 0 or (source != drone and not rules.relays):
-            continue
-        held, notes = versions[drone, source], air.notes[world, drone, source]
-        for tile in range(notes.shape[0]):
-            row, column = tile // tile_columns, tile % tile_columns
-            version = np.int64(held[row, column])
-            if version == 0:
-                continue
-            note = notes[tile]
-            was_sent = note.sent_tick > NEVER
-            sent_at = note.sent_tick / rate
-            if was_sent and now - sent_at < rules.tile_period:
-                continue
-            missing, stale = 0, 0
-            for peer in range(drones):
-                has = np.int64(holdings[peer, source, tile])
-                if has >= version or (readers >> peer) & 1 == 0 or peer == source:
-                    continue
-                if was_sent and np.int64(note.sent_version) >= version:
-                    if peers[peer].digest_tick / rate < sent_at + _DIGEST_GRACE_S:
-                        continue  # sent since this peer last told what it holds
-                if source != drone and (readers >> source) & 1 == 1:
-                    if (peers[peer].hears >> source) & 1 == 1 and (peers[source].hears >> peer) & 1 == 1:
-                        continue  # source and peer hear each other: the source sends its newest tiles itself
-                missing += has == 0
-                stale += version - has
-            if stale > 0:
-                rank = (_MISSING - 1 - missing) * _STALE + max(0, _STALE - 1 - stale)
-                place = column * _ROWS + row  # ties in the order of tile keys
-                wanted[node.wanted] = ((rank * 2 + (source != drone)) * _SOURCES + source) * _PLACES + place
-                node.wanted += 1
-    _sort(wanted, node.wanted)
-    node.wanted = min(node.wanted, MOST_WANTED)
-
-
-@numba.njit(cache=True, nogil=True)
-def _sort(values, count):  # type: ignore[no-untyped-def]
-    """Sort the first `count` values, in place: a Shell sort with Knuth's gaps (1973), for it needs no memory."""
-    gap = 1
-    while gap < count // 3:
-        gap = 3 * gap + 1
-    while gap > 0:
-        for i in range(gap, count):
-            value, j = values[i], i
-            while j >= gap and values[j - gap] > value:
-                values[j] = values[j - gap]
-                j -= gap
-            values[j] = value
-        gap //= 3
 
 
 @numba.njit(cache=True, nogil=True)
@@ -305,14 +252,14 @@ def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-u
     tile_columns, slots = versions.shape[3], air.tile_cells.shape[2]
     now = tick / air.rules.ticks_per_s
     while node.wanted > 0:
-        source = wanted[0] // _PLACES % _SOURCES
+        source, _, _ = source_and_tile(wanted[0])
         cells = layers[drone, source] if source == drone else air.confirmed[world, drone, source]
         held, notes = versions[drone, source], air.notes[world, drone, source]
         reserved, size, count = _RESERVED_TILES, 0, 0
         for entry in range(node.wanted):
-            if wanted[entry] // _PLACES % _SOURCES != source:
+            its_source, row, column = source_and_tile(wanted[entry])
+            if its_source != source:
                 continue
-            row, column = wanted[entry] % _ROWS, wanted[entry] % _PLACES // _ROWS
             note = notes[row * tile_columns + column]
             if note.cost_version != held[row, column]:
                 note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), held[row, column]
@@ -327,11 +274,11 @@ def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-u
         place = _transmit(air.rules, now, node, messages, counters, TILES, size)
         left = taken = 0
         for entry in range(node.wanted):
-            if taken == count or wanted[entry] // _PLACES % _SOURCES != source:
+            its_source, row, column = source_and_tile(wanted[entry])
+            if taken == count or its_source != source:
                 wanted[left] = wanted[entry]
                 left += 1
                 continue
-            row, column = wanted[entry] % _ROWS, wanted[entry] % _PLACES // _ROWS
             tile = row * tile_columns + column
             if place >= 0:
                 slot = (node.first_tile + node.tiles + taken) % slots

@@ -27,25 +27,27 @@ def take_decisions(first, last, intents, actions, parameters, poses):  # type: i
 
 
 @numba.njit(cache=True, nogil=True)
-def hear_peers(first, last, positions, ages, connected, poses, dt, active):  # type: ignore[no-untyped-def]
-    """Let a tick of `dt` seconds pass and note where the peers are that are heard now.
+def hear_peers(first, last, positions, ages, explorer_ages, peers, ticks, ticks_per_s, active):  # type: ignore[no-untyped-def]
+    """Note what drones were told of their peers by `ticks` `[world]`, as `onboard.teammates` does from their nodes.
 
-    `positions` float64 `[world, drone, peer, 2]` and `ages` `[world, drone, peer]` as in `PeerPoses`, a drone's own
-    age staying inf; `connected` bool `[world, sender, receiver]`.
+    `positions` float64 `[world, drone, peer, 2]` and `ages` `[world, drone, peer]` as in `PeerPoses`, where a peer
+    that never said where it is has an age of inf; in `explorer_ages` so has one that never said what it does. `peers`
+    are the air's PEER records `[world, drone, peer]`.
     """
-    drones = poses.shape[1]
+    drones = positions.shape[1]
     for world in range(first, last):
         if not active[world]:
             continue
+        now = ticks[world] / ticks_per_s
         for drone in range(drones):
             for peer in range(drones):
-                if peer == drone:
+                told = peers[world, drone, peer]
+                if told.pose_tick < 0:
                     continue
-                ages[world, drone, peer] += dt
-                if connected[world, peer, drone]:
-                    ages[world, drone, peer] = 0.0
-                    positions[world, drone, peer, 0] = poses[world, peer, 0]
-                    positions[world, drone, peer, 1] = poses[world, peer, 1]
+                positions[world, drone, peer, 0], positions[world, drone, peer, 1] = told.x, told.y
+                ages[world, drone, peer] = now - told.heard_tick / ticks_per_s
+                if told.status_tick >= 0:
+                    explorer_ages[world, drone, peer] = ages[world, drone, peer]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -10,6 +10,7 @@ from imagine.core.contract import ActionSpec
 from imagine.core.observation import MOTION, option_parameters
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.visits import visit_levels
+from imagine.sim.air import Air
 from imagine.sim.decision_kernels import (
     count_visits,
     fill_option_numbers,
@@ -23,8 +24,8 @@ from imagine.sim.workers import Workers
 class DecisionState:
     """The state behind the options of an observation and behind actions, for drones `[worlds, drones]`.
 
-    `positions` float64 `[worlds, drones, peers, 2]` and `ages` `[worlds, drones, peers]` are what each drone heard of
-    the others (`PeerPoses`); `own_visits` and `peer_visits` uint16 `[worlds, drones, rows // 2, columns // 2]`, empty
+    `positions` float64 `[worlds, drones, peers, 2]` and `ages` `[worlds, drones, peers]` are what each drone was told
+    by the others (`PeerPoses`), `explorer_ages` the same for those who said that they explore; `own_visits` and `peer_visits` uint16 `[worlds, drones, rows // 2, columns // 2]`, empty
     where the specification shows none; `intents` float64 `[worlds, drones, 3]` the decisions that stand.
     """
 
@@ -52,36 +53,42 @@ class DecisionState:
         self.peer_visits = np.zeros(grid if self._sees_team else nothing, np.uint16)
         self.positions = np.zeros((worlds, drones, drones, 2))
         self.ages = np.full((worlds, drones, drones), np.inf)
+        self.explorer_ages = self.ages.copy()
         self.intents = np.zeros((worlds, drones, 3))
 
     def clear(self, world: int) -> None:
         """Forget everything of a world."""
         self.own_visits[world] = 0
         self.peer_visits[world] = 0
-        self.ages[world] = np.inf
+        self.ages[world] = self.explorer_ages[world] = np.inf
 
     def sense(
         self,
         poses: NDArray[np.float64],
-        connected: NDArray[np.bool_],
+        air: Air,
+        ticks: NDArray[np.int64],
         origins: NDArray[np.int64],
         alive: NDArray[np.bool_],
         active: NDArray[np.bool_],
-        dt: float,
     ) -> None:
-        """Hear the peers and count the visits of a tick of `dt` seconds, in the `active` worlds (`[worlds]`).
+        """Hear the peers and count the visits of the tick `ticks` (`[worlds]`), in the `active` worlds (`[worlds]`).
 
-        `poses` `[worlds, drones, 3]`, `connected` bool `[worlds, sender, receiver]`, `origins` of the grids in cells
-        `[worlds, 2]`, `alive` bool `[worlds, drones]`. Call it once after the maps' update, and once at a launch.
+        `poses` `[worlds, drones, 3]`, `origins` of the grids in cells `[worlds, 2]`, `alive` bool `[worlds, drones]`.
+        Call it once after the air has delivered what arrives in the tick, and once at a launch. Nobody is known under
+        the protocol `off`, as on board.
         """
         if self._spec.peers == 0 and not self._sees_team and self._spec.visits == "off":
             return
         worlds = len(poses)
-        self._workers.over(worlds, hear_peers, self.positions, self.ages, connected, poses, dt, active)
+        if air.rules.shares:
+            self._workers.over(
+                worlds, hear_peers, self.positions, self.ages, self.explorer_ages, air.state.peers, ticks,
+                air.rules.ticks_per_s, active,
+            )  # fmt: skip
         if self._spec.visits != "off":
             self._workers.over(
-                worlds, count_visits, self.own_visits, self.peer_visits, self._sees_team, self.positions, self.ages,
-                poses, origins, alive, active,
+                worlds, count_visits, self.own_visits, self.peer_visits, self._sees_team, self.positions,
+                self.explorer_ages, poses, origins, alive, active,
             )  # fmt: skip
 
     def fill(

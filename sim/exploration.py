@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from imagine.core.errors import InputError
 from imagine.core.lidar import TEAMMATE_RADIUS_M
 from imagine.sim.air import Air
-from imagine.sim.air_receive import claim_all
+from imagine.sim.air_receive import claim_own
 from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
 from imagine.sim.decision_state import DecisionState
 from imagine.sim.exploration_settings import ExplorationSettings
@@ -139,12 +139,13 @@ class Exploration:
 
     def reset(self) -> Observation:
         """Start a new episode in every world."""
+        self._now = 1 - self._now
         for world in range(self.worlds):
             self._restart(world)
             if self.settings.stagger:
                 share = (world + 1) / self.worlds
                 self._limit[world] = max(50, round(self.settings.episode_ticks * share))
-        self._run(np.full(self.worlds, LAUNCHING))
+        self._run(np.full(self.worlds, LAUNCHING), np.full(self.worlds, LAUNCHING))
         return self._observation()
 
     def _restart(self, world: int) -> None:
@@ -180,7 +181,8 @@ class Exploration:
         if self._restarts and done.any():
             for world in np.flatnonzero(done):
                 self._restart(int(world))
-            self._run(np.where(done, LAUNCHING, WAITING))  # what they see at their launch is nobody's gain
+            launching = np.where(done, LAUNCHING, WAITING)
+            self._run(launching, launching)  # what they see at their launch is nobody's gain
         return Step(self._observation(), reward, done, episodes)
 
     def _check(self, actions: NDArray[np.float32]) -> None:
@@ -200,7 +202,8 @@ class Exploration:
         touched = self.twin.contacts.copy()
         flying = self.alive & running[:, None]
         self.ticks += running
-        self._run(np.where(running, FLYING, WAITING), observes)
+        shown = np.full(self.worlds, FLYING if observes else WAITING)  # also those that ended before the others
+        self._run(np.where(running, FLYING, WAITING), shown)
         gained = np.where(running[:, None], self.maps.arrays.gained, 0)
         begun = self.twin.contacts - touched
         coverage = self.maps.coverage()
@@ -215,8 +218,9 @@ class Exploration:
         running &= ~over
         return earned
 
-    def _run(self, modes: NDArray[np.int64], observes: bool = True) -> None:
-        """Run a tick in all worlds, as `modes` says for each."""
+    def _run(self, modes: NDArray[np.int64], shown: NDArray[np.int64]) -> None:
+        """Run a tick in all worlds, as `modes` says for each, and observe those whose mode in `shown` is not WAITING."""
+        observes = bool((shown != WAITING).any())
         twin = self.twin
         sensors, flight = twin.sensors(self._sight_m), twin.kernel_args()
         levels = sensors.levels, sensors.rows
@@ -247,7 +251,7 @@ class Exploration:
             lap("derive")
             if observes:
                 observe(
-                    first, last, modes, seen["views"], seen["lidar"], seen["motion"], maps.belief, maps.cost,
+                    first, last, shown, seen["views"], seen["lidar"], seen["motion"], maps.belief, maps.cost,
                     maps.origins, self.estimates, twin.velocity, self.ranges, self._specs,
                 )  # fmt: skip
                 lap("observe")
@@ -255,7 +259,7 @@ class Exploration:
         twin.workers.over(self.worlds, run_part, scratch=self.maps.scratch)
         twin.ticks += 1
         active = modes != WAITING
-        self.decisions.sense(self.estimates, self.links(), self.maps.origins, self.alive, active, self.dt)
+        self.decisions.sense(self.estimates, self.air, self.ticks, self.maps.origins, self.alive, active)
         if observes:
             self.decisions.fill(seen["views"], seen["motion"], self.estimates, self.maps.origins)
 
@@ -287,7 +291,7 @@ class Exploration:
 
     def _metrics(self, world: int) -> EpisodeMetrics:
         maps, twin, own = self.maps, self.twin, range(self.drones)
-        claim_all(self.air.state, world, maps.layers[world], maps.versions[world])
+        claim_own(self.air.state, world, maps.layers[world])
         totals = EpisodeTotals(
             level=twin.levels[world].name,
             coverable=int(maps.coverable_cells[world]),

@@ -7,6 +7,7 @@ world looks at another, so threads may share worlds out.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numba
@@ -15,13 +16,14 @@ from numpy.typing import NDArray
 
 from imagine.core.action import Parameters, body_velocity_kernel
 from imagine.core.observation import MOTION, fill_motion, fill_sectors, fill_views
+from imagine.core.raster import CELL
 from imagine.core.shield import shield_kernel
 from imagine.sim.air_receive import deliver, meet, peer_place
-from imagine.sim.air_send import send
+from imagine.sim.air_send import canvas, send
 from imagine.sim.odometry_drift import advance_worlds
 from imagine.sim.physics import step_worlds
 from imagine.sim.scan_world import scan_world
-from imagine.sim.team_maps import integrate_scans
+from imagine.sim.team_maps import integrate_scan_of
 
 WAITING, FLYING, LAUNCHING = 0, 1, 2
 """What a world does in a tick: nothing, all stages, or all but flying, for what is seen at the launch."""
@@ -97,7 +99,7 @@ def share(first, last, modes, ticks, keys, poses, velocity, estimates, alive, ra
     """
     arrays, rows = levels
     drones = poses.shape[1]
-    places = np.empty((drones, drones, 2))
+    places = np.empty((drones, 2))
     for world in range(first, last):
         if modes[world] == WAITING:
             continue
@@ -110,14 +112,24 @@ def share(first, last, modes, ticks, keys, poses, velocity, estimates, alive, ra
         if modes[world] == LAUNCHING:
             meet(air, world, tick, estimates[world])
         for drone in range(drones):
+            maps.gained[world, drone] = maps.changed[world, drone] = 0
+            if not alive[world, drone]:
+                continue
             for peer in range(drones):
                 x, y, known = peer_place(air.peers[world, drone, peer], tick, air.rules)
                 known = known and peer != drone
-                places[drone, peer, 0], places[drone, peer, 1] = (x, y) if known else (np.nan, np.nan)
-        integrate_scans(world, maps, pens, ranges[world], estimates[world], places, alive[world], scratch)
+                places[peer, 0], places[peer, 1] = (x, y) if known else (np.nan, np.nan)
+            pose = estimates[world, drone]
+            own_row = math.floor(pose[1] / CELL) - maps.origins[world, 1]
+            own_column = math.floor(pose[0] / CELL) - maps.origins[world, 0]
+            slot, _, _ = canvas(air, world, drone, own_row, own_column)
+            integrate_scan_of(
+                world, drone, maps, pens, ranges[world, drone], pose, places, air.marks[world, drone, slot],
+                scratch.kept,
+            )  # fmt: skip
         send(
-            air, world, tick, estimates[world], velocity[world], alive[world], ranges[world], scratch.marks,
-            scratch.corners, maps.clocks[world], maps.layers[world], maps.versions[world],
+            air, world, tick, estimates[world], velocity[world], alive[world], ranges[world], maps.clocks[world],
+            maps.layers[world], maps.versions[world],
         )  # fmt: skip
 
 

@@ -27,6 +27,8 @@ from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec
 from imagine.core.raster import LIMIT, TILE, apply_marks, beam_directions, mark_scan, ray_table
 from imagine.sim.workers import Workers
 
+_ROUNDING_M = 1e-6
+
 
 class MapArrays(NamedTuple):
     """The maps of all worlds, as kernels take them.
@@ -67,14 +69,8 @@ class Pens(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What one thread works with, one world after another, so that it stays in the cache.
+    """What one thread works with, one drone after another, so that it stays in the cache."""
 
-    `marks` int8 `[drones, rows, width]` are the newest scans drawn, `corners` int64 `[drones, 2]` the grid
-    row and column of their first cell.
-    """
-
-    marks: NDArray[np.int8]
-    corners: NDArray[np.int64]
     dirty: NDArray[np.int32]
     is_dirty: NDArray[np.uint8]
     heads: NDArray[np.int32]
@@ -123,7 +119,6 @@ class TeamMaps:
         cells = padded[0] * padded[1]
         self.scratch = [
             Scratch(
-                np.zeros((drones, *table.sheet), np.int8), np.zeros((drones, 2), np.int64),
                 np.empty(cells, np.int32), np.zeros(cells, np.uint8), *search_scratch(cells),
                 np.empty((tiles[0] * tiles[1], 4), np.int64), np.empty(lidar.beams, np.float32),
             )
@@ -150,56 +145,50 @@ class TeamMaps:
 
 
 @numba.njit(cache=True, nogil=True)
-def integrate_scans(world, maps, pens, ranges, poses, places, active, scratch):  # type: ignore[no-untyped-def]
-    """Add the scans of one world's `active` drones to their own layers; count what nobody had seen before.
+def integrate_scan_of(world, drone, maps, pens, ranges, pose, places, marks, kept):  # type: ignore[no-untyped-def]
+    """Add a drone's scan to its own layer, and count what nobody had seen before.
 
-    `ranges` float32 `[drones, beams]`, `poses` `[drones, 3]`; `places` `[drones, drones, 2]` are where a drone takes
-    its teammates to be (nan: unknown), whose returns it leaves out. Leaves the marks in `scratch`.
+    `ranges` float32 `[beams]`, `pose` (x, y, yaw); `places` `[drones, 2]` are where it takes its teammates to be (nan:
+    unknown), whose returns it leaves out. Draws into `marks`, a sheet as in `mark_scan`; `kept` is scratch for a scan.
     """
-    drones = maps.clocks.shape[1]
-    column0, row0 = maps.origins[world, 0], maps.origins[world, 1]
-    for drone in range(drones):
-        maps.gained[world, drone] = 0
-        maps.changed[world, drone] = 0
-        if not active[drone]:
-            continue
-        x, y, yaw = poses[drone, 0], poses[drone, 1], poses[drone, 2]
-        kept, marks = scratch.kept, scratch.marks[drone]
-        _without_teammates(kept, ranges[drone], pens.directions, poses[drone], places[drone], pens.range_cap)
-        row, column = mark_scan(
-            marks, x, y, yaw, pens.directions, kept, pens.range_min, pens.range_cap, pens.starts, pens.offsets
-        )
-        scratch.corners[drone, 0], scratch.corners[drone, 1] = row - row0, column - column0
-        cells, dirty, versions = maps.layers[world, drone, drone], maps.dirty[world, drone], maps.versions[world, drone]
-        touched = np.zeros(dirty.shape, np.bool_)
-        changed = apply_marks(cells, marks, row - row0, column - column0, touched)
-        maps.changed[world, drone] = changed
-        if changed == 0:
-            continue
-        maps.clocks[world, drone] += np.uint32(1)
-        for i in range(dirty.shape[0]):
-            for j in range(dirty.shape[1]):
-                if touched[i, j]:
-                    versions[drone, i, j] = maps.clocks[world, drone]
-                    dirty[i, j] = 1
-                    maps.gained[world, drone] += _see(cells, maps.seen[world], maps.coverable[world], i, j)
-        maps.discovered[world, drone] += maps.gained[world, drone]
+    _without_teammates(kept, ranges, pens.directions, pose, places)
+    row, column = mark_scan(
+        marks, pose[0], pose[1], pose[2], pens.directions, kept, pens.range_min, pens.range_cap, pens.starts,
+        pens.offsets,
+    )  # fmt: skip
+    cells, dirty = maps.layers[world, drone, drone], maps.dirty[world, drone]
+    versions = maps.versions[world, drone, drone]
+    touched = np.zeros(dirty.shape, np.bool_)
+    changed = apply_marks(cells, marks, row - maps.origins[world, 1], column - maps.origins[world, 0], touched)
+    maps.changed[world, drone] = changed
+    if changed == 0:
+        return
+    maps.clocks[world, drone] += np.uint32(1)
+    for i in range(dirty.shape[0]):
+        for j in range(dirty.shape[1]):
+            if touched[i, j]:
+                versions[i, j] = maps.clocks[world, drone]
+                dirty[i, j] = 1
+                maps.gained[world, drone] += _see(cells, maps.seen[world], maps.coverable[world], i, j)
+    maps.discovered[world, drone] += maps.gained[world, drone]
 
 
 @numba.njit(cache=True, nogil=True)
-def _without_teammates(kept, ranges, directions, pose, places, range_cap):  # type: ignore[no-untyped-def]
+def _without_teammates(kept, ranges, directions, pose, places):  # type: ignore[no-untyped-def]
     """Copy a scan with its returns on teammates at `places` made invalid (nan)."""
     for beam in range(len(ranges)):
         kept[beam] = ranges[beam]
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for peer in range(len(places)):
         dx, dy = places[peer, 0] - pose[0], places[peer, 1] - pose[1]
-        if not dx * dx + dy * dy <= (range_cap + TEAMMATE_RADIUS_M) ** 2:  # nor where it is unknown
-            continue
+        apart = math.sqrt(dx * dx + dy * dy)
+        if not apart < np.inf:
+            continue  # nobody knows where it is
         ahead, left = c * dx + s * dy, -s * dx + c * dy
-        for beam in range(len(kept)):
+        nearest, furthest = apart - TEAMMATE_RADIUS_M - _ROUNDING_M, apart + TEAMMATE_RADIUS_M + _ROUNDING_M
+        for beam in range(len(kept)):  # returns beyond the range cap too, as on board: they free nothing either
             r = np.float64(kept[beam])
-            if r < np.inf:
+            if nearest < r < furthest:
                 ex, ey = r * directions[beam, 0] - ahead, r * directions[beam, 1] - left
                 if ex * ex + ey * ey < TEAMMATE_RADIUS_M * TEAMMATE_RADIUS_M:
                     kept[beam] = np.nan

@@ -12,7 +12,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from imagine.core.frontier import FREE, OCCUPIED, UNKNOWN, frontier_field, own_distance, plan_cell
+from imagine.core.frontier import (
+    BLOCKED,
+    FREE,
+    OCCUPIED,
+    PAD,
+    UNKNOWN,
+    frontier_field,
+    has_frontier,
+    own_distance,
+    plan_cell,
+    refresh_kinds,
+    refresh_states,
+    search_scratch,
+    update_costs,
+)
+from imagine.core.raster import TILE
 
 STRAIGHT_M, DIAGONAL_M, NEAR_WALL = 0.20, 0.28, 3.0
 AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
@@ -185,3 +200,89 @@ def test_a_point_reads_its_own_cell_or_the_best_within_two() -> None:
     in_the_wall = own_distance(field, origin, 0.41, 0.61)
     assert in_the_wall == pytest.approx(float(field.distance[1, 3:6].min()))
     assert math.isinf(own_distance(field, origin, 50.0, 50.0))
+
+
+class KeptField:
+    """A field that is kept up to date tile by tile, as the twin keeps those of its drones."""
+
+    def __init__(self, tile_rows: int, tile_columns: int) -> None:
+        self.belief = np.zeros((tile_rows * TILE, tile_columns * TILE), np.int8)
+        shape = tile_rows * TILE // 2 + 2 * PAD, tile_columns * TILE // 2 + 2 * PAD
+        self.states, self.kinds = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+        self.cost = np.full(shape, BLOCKED, np.int16)
+        self.dirty, self.is_dirty = np.empty(self.cost.size, np.int32), np.zeros(self.cost.size, np.uint8)
+        self.scratch = search_scratch(self.cost.size)
+
+    def become(self, belief: NDArray[np.int8], rng: np.random.Generator) -> None:
+        """Take over a belief, looking only at the tiles where it differs, in any order."""
+        blocks = (belief != self.belief).reshape(len(belief) // TILE, TILE, -1, TILE)
+        tiles = rng.permutation(np.argwhere(blocks.any(axis=(1, 3))))
+        self.belief = belief.copy()
+        boxes = [refresh_states(self.belief, self.states, row, column) for row, column in tiles]
+        count = 0
+        for box in boxes:
+            if box[0] <= box[1]:
+                count = refresh_kinds(self.states, self.kinds, self.cost, box, self.dirty, count, self.is_dirty)
+        update_costs(self.cost, self.kinds, self.dirty, count, self.is_dirty, self.scratch)
+
+
+def change(belief: NDArray[np.int8], rng: np.random.Generator) -> NDArray[np.int8]:
+    """Return a belief changed as flights change it, or worse: patches, walls, doors, specks, forgetting, a tile."""
+    rows, columns = belief.shape
+    out = belief.copy()
+    for _ in range(rng.integers(1, 4)):
+        row, column = int(rng.integers(rows)), int(rng.integers(columns))
+        value = int(rng.choice([-8, -1, 0, 2, 8]))
+        match int(rng.integers(7)):
+            case 0:
+                out[row : row + rng.integers(1, rows), column : column + rng.integers(1, columns)] = value
+            case 1:
+                out[row : row + 2, column : column + rng.integers(2, columns)] = 8  # a wall
+            case 2:
+                out[row : row + rng.integers(2, rows), column : column + 2] = 8
+            case 3:
+                out[row : row + rng.integers(2, 8), column : column + rng.integers(2, 8)] = -8  # a door
+            case 4:
+                out[rng.random(out.shape) < rng.choice([0.001, 0.02])] = value
+            case 5:
+                out[out == 0] = -1  # all is known
+            case _:
+                row, column = row // TILE * TILE, column // TILE * TILE
+                out[row : row + TILE, column : column + TILE] = value
+    return out
+
+
+@settings(max_examples=80)
+@given(st.integers(1, 3), st.integers(1, 3), st.integers(1, 14), st.integers(0, 2**32 - 1))
+def test_a_field_kept_up_to_date_is_the_field_from_nothing(rows: int, columns: int, steps: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    kept = KeptField(rows, columns)
+    for _ in range(steps):
+        kept.become(change(kept.belief, rng), rng)
+        field = frontier_field(kept.belief)
+        np.testing.assert_array_equal(kept.states, field.padded_states)
+        np.testing.assert_array_equal(kept.cost, field.cost)
+        assert has_frontier(kept.kinds) == (field.cost == 0).any()
+        assert not kept.is_dirty.any()
+        assert (kept.scratch[0] == -1).all()  # clean for whichever field is next
+    np.testing.assert_allclose(field.distance, reference(field.states), rtol=1e-6)
+
+
+def test_a_door_that_opens_and_shuts_on_a_long_way_round_changes_all_beyond_it() -> None:
+    """Two rooms and one frontier: with the door shut the second room's distances go round, then nowhere."""
+    rng = np.random.default_rng(0)
+    belief = np.full((64, 96), -8, np.int8)
+    belief[[0, 1, -1, -2], :] = belief[:, [0, 1, -1, -2]] = 8
+    belief[:, 46:50] = 8
+    belief[20:26, 46:50] = belief[50:56, 46:50] = -8  # two doors
+    belief[30:36, 4:10] = 0  # the frontier, in the left room
+    kept = KeptField(2, 3)
+    kept.become(belief, rng)
+    costs = []
+    for doors in ((8, -8), (8, 8), (-8, 8), (-8, -8)):
+        belief[20:26, 46:50], belief[50:56, 46:50] = doors
+        kept.become(belief, rng)
+        np.testing.assert_array_equal(kept.cost, frontier_field(belief).cost)
+        costs.append(int(kept.cost[PAD + 10, PAD + 40]))
+    assert costs[1] == 32767
+    assert costs[0] > costs[2] == costs[3]

@@ -1,8 +1,9 @@
-"""The training world is the flying world: same maps, observations and setpoints, and a reward that adds up."""
+"""The training world is the flying world: same setpoints, same coverage, and a reward that adds up."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,18 +13,15 @@ from numpy.typing import NDArray
 from imagine.core.action import to_body_velocity
 from imagine.core.contract import ActionSpec
 from imagine.core.errors import InputError
-from imagine.core.evidence import EvidenceMap
-from imagine.core.frames import Pose
-from imagine.core.frontier import frontier_field
-from imagine.core.lidar import TEAMMATE_RADIUS_M, Scan, mask_near
-from imagine.core.observation import observe
+from imagine.core.lidar import Scan
 from imagine.core.observation_spec import ObservationSpec
-from imagine.core.planner import plan_velocity
 from imagine.core.shield import shield_velocity
 from imagine.sim.coverage import Coverage
 from imagine.sim.exploration import Exploration, Step
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.level import load_level
+from imagine.sim.radio import RadioMedium, RadioSettings
+from imagine.sim.reward import RewardSettings
 
 SMALL: dict[str, Any] = {
     "levels": ("3",), "worlds": 1, "drones": 2, "mirror": False, "observation": ObservationSpec(view_cells=16),
@@ -43,69 +41,6 @@ def planner_step(env: Exploration) -> Step:
     return env.step(np.nan_to_num(env.planner_actions()))
 
 
-class OnBoard:
-    """What one drone of a team has on board: its evidence map, fed as the runner feeds it."""
-
-    def __init__(self, env: Exploration, drone: int) -> None:
-        self.env, self.drone = env, drone
-        self.evidence = EvidenceMap(drone)
-        self.pose, self.scan = Pose(0, 0, 0), Scan(0.0, np.empty(0, np.float32))
-
-    def look(self) -> None:
-        x, y, yaw = (float(number) for number in self.env.twin.poses[0, self.drone])
-        self.pose, self.scan = Pose(x, y, yaw), Scan(0.0, self.env.twin.scan()[0, self.drone])
-        heard = self.env.twin.poses[0, self.env.links()[0, self.drone], :2]
-        kept = mask_near(self.scan.ranges, self.env.lidar, self.pose, heard, TEAMMATE_RADIUS_M)
-        self.evidence.integrate(self.pose, Scan(0.0, kept), self.env.lidar, self.env.settings.map.range_cap_m)
-
-    def hear(self, team: list[OnBoard]) -> None:
-        for other in team:
-            if self.env.links()[0, other.drone, self.drone]:
-                for key, version in other.evidence.versions(other.drone).items():
-                    self.evidence.merge_tile(other.drone, key, version, other.evidence.tile(other.drone, key))
-
-    def observation(self) -> dict[str, NDArray[np.float32]]:
-        belief = self.evidence.belief()
-        vx, vy, rate = self.env.twin.velocity[0, self.drone]
-        return observe(
-            self.env.settings.observation, belief, frontier_field(belief), self.evidence.origin_cells, self.pose,
-            (vx, vy), rate, self.scan, self.env.lidar,
-        )  # fmt: skip
-
-    def planned(self) -> tuple[float, float] | None:
-        field = frontier_field(self.evidence.belief())
-        return plan_velocity(field, self.evidence.origin_cells, self.pose, self.scan, self.env.lidar, 1.0)
-
-
-@pytest.mark.parametrize("axes", ["map", "heading"])
-@pytest.mark.parametrize("protocol", ["off", "one-hop"])
-def test_what_trains_is_what_flies_bit_for_bit(axes: Any, protocol: Any) -> None:
-    spec = ObservationSpec(view_cells=16, axes=axes)
-    env = Exploration(
-        settings(observation=spec, protocol=protocol, tiles_a_tick=1000, action=ActionSpec(mode="body")), seed=4
-    )
-    rng = np.random.default_rng(0)
-    seen = env.reset()
-    team = [OnBoard(env, drone) for drone in range(2)]
-    for _ in range(25):
-        for own in team:
-            own.look()
-        for own in team:
-            own.hear(team)
-        planned = env.planner_actions()
-        for own in team:
-            for name, array in own.observation().items():
-                np.testing.assert_array_equal(array, seen.policy[name][0, own.drone], err_msg=name)
-            wanted = own.planned()
-            if wanted is None:
-                assert np.isnan(planned[0, own.drone]).all()
-            else:
-                c, s = math.cos(own.pose.yaw), math.sin(own.pose.yaw)
-                ahead = c * wanted[0] + s * wanted[1], -s * wanted[0] + c * wanted[1], 0.0
-                assert planned[0, own.drone] == pytest.approx(ahead, abs=1e-6)
-        seen = env.step(random_actions(env, rng)).observation
-
-
 @pytest.mark.parametrize("mode", ["plane", "body"])
 @pytest.mark.parametrize("axes", ["map", "heading"])
 def test_actions_become_the_setpoints_that_fly(mode: Any, axes: Any) -> None:
@@ -116,13 +51,13 @@ def test_actions_become_the_setpoints_that_fly(mode: Any, axes: Any) -> None:
     shielded = 0
     for _ in range(60):
         actions = 1.4 * random_actions(env, rng)
-        setpoints, scans = env._setpoints(actions), env.twin.scan()
-        for world, drone in np.ndindex(3, 2):
-            vx, vy, rate = to_body_velocity(actions[world, drone], spec, axes, float(env.twin.poses[world, drone, 2]))
-            safe = shield_velocity(vx, vy, Scan(0.0, scans[world, drone]), env.lidar, env.settings.limits)
-            assert setpoints[world, drone] == pytest.approx((*safe, rate), abs=1e-9)
-            shielded += safe != (vx, vy)
+        scans, yaws = env.ranges.copy(), env.twin.poses[..., 2].copy()
         env.step(actions)
+        for world, drone in np.ndindex(3, 2):
+            vx, vy, rate = to_body_velocity(actions[world, drone], spec, axes, float(yaws[world, drone]))
+            safe = shield_velocity(vx, vy, Scan(0.0, scans[world, drone]), env.lidar, env.settings.limits)
+            assert env._setpoints[world, drone] == pytest.approx((*safe, rate), abs=1e-9)
+            shielded += safe != (vx, vy)
     assert shielded > 10
 
 
@@ -140,7 +75,7 @@ def test_the_shield_keeps_a_team_off_the_walls() -> None:
 
 
 def test_rewards_sum_to_the_share_discovered() -> None:
-    env = Exploration(settings(reward_scale=5.0, own_credit=0.3, drones=3), seed=2)
+    env = Exploration(settings(reward=RewardSettings(area_weight=5.0, own_credit=0.3), drones=3), seed=2)
     env.reset()
     for _ in range(30):
         before = env.maps.discovered.copy()
@@ -165,10 +100,11 @@ def run(seed: int, ticks: int = 25, **changes: Any) -> list[NDArray[Any]]:
     env = Exploration(settings(levels=("1", "3"), worlds=2, mirror=True, **changes), seed)
     rng = np.random.default_rng(0)
     seen = env.reset()
-    told = [seen.policy["views"], seen.critic]
+    told = [seen.policy["views"].copy(), seen.critic]
     for _ in range(ticks):
         step = env.step(random_actions(env, rng))
-        told += [*step.observation.policy.values(), step.observation.critic, step.reward, step.done]
+        seen = step.observation
+        told += [*(array.copy() for array in seen.policy.values()), seen.critic, step.reward, step.done]
     return told
 
 
@@ -176,19 +112,6 @@ def test_equal_seeds_give_equal_runs_and_others_do_not() -> None:
     first, again, other = run(7, episode_ticks=15), run(7, episode_ticks=15), run(8, episode_ticks=15)
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     assert not all(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
-
-
-def test_a_world_is_the_same_whatever_flies_beside_it() -> None:
-    alone, beside = (Exploration(settings(worlds=worlds, episode_ticks=20), seed=5) for worlds in (1, 3))
-    alone.reset()
-    beside.reset()
-    rng = np.random.default_rng(0)
-    for _ in range(45):
-        actions = random_actions(beside, rng)
-        one, many = alone.step(actions[:1]), beside.step(actions)
-        for name, array in one.observation.policy.items():
-            np.testing.assert_array_equal(array[0], many.observation.policy[name][0])
-        np.testing.assert_array_equal(one.reward[0], many.reward[0])
 
 
 def test_saved_generators_give_the_same_next_episodes() -> None:
@@ -225,7 +148,7 @@ def test_worlds_end_at_their_length_tell_how_it_went_and_start_anew() -> None:
             assert 1.0 <= episode.overlap <= 2.0
         if step.done.any():
             assert not env.ticks.any()
-            assert (env.maps.clocks == 1).all()  # the one scan from the launch poses of the next episode
+            assert (env.maps.arrays.clocks == 1).all()  # the one scan from the launch poses of the next episode
             assert not step.observation.policy["motion"].any()
             assert step.observation.policy["views"].any()
 
@@ -278,14 +201,40 @@ def test_first_episodes_can_be_staggered() -> None:
 
 
 @pytest.mark.parametrize("protocol", ["off", "one-hop", "multi-hop"])
-def test_links_are_a_disc_without_the_diagonal(protocol: Any) -> None:
-    env = Exploration(settings(drones=3, levels=("6",), protocol=protocol, radio_range_m=5.0), seed=0)
-    env.twin.poses[0, :, :2] = [[0.0, 0.0], [4.0, 0.0], [8.0, 3.0]]
-    linked = env.links()[0].tolist()
-    if protocol == "off":
-        assert not np.any(linked)
-    else:
-        assert linked == [[False, True, False], [True, False, True], [False, True, False]]
+@pytest.mark.parametrize("radio", [{"range_m": 4.0}, {"model": "path-loss", "wall_db": 25.0}], ids=["disc", "walls"])
+def test_links_are_whom_the_radio_reaches(protocol: Any, radio: dict[str, Any]) -> None:
+    env = Exploration(settings(drones=3, levels=("6",), protocol=protocol, radio=RadioSettings(**radio)), seed=0)
+    env.reset()
+    medium = RadioMedium(3, env.settings.radio, np.random.default_rng(0), env.twin.levels[0].segments)
+    reached = set()
+    for tick in range(120):
+        planner_step(env)
+        expected = medium.in_reach(env.twin.poses[0])[1:, 1:] & env.alive[0] & env.alive[0][:, None]
+        linked = env.links()[0]
+        assert linked.tolist() == (expected if protocol != "off" else np.zeros((3, 3), bool)).tolist()
+        assert (linked == linked.T).all()
+        assert not linked.diagonal().any()
+        reached.add(int(expected.sum()))
+        env.alive[0, 1] = tick < 100
+    assert len(reached) > 1  # they met, or parted
+
+
+def test_the_fallen_say_and_hear_nothing() -> None:
+    env = Exploration(settings(drones=3, radio=RadioSettings(range_m=50.0)), seed=0)
+    env.reset()
+    for _ in range(10):
+        planner_step(env)
+    assert env.links()[0].sum() == 6
+    env.alive[0, 1] = False
+    planner_step(env)
+    sent, layers = env.air.bytes_sent[0].copy(), env.maps.layers[0].copy()
+    for _ in range(20):
+        planner_step(env)
+    assert env.links()[0].tolist() == [[False, False, True], [False] * 3, [True, False, False]]
+    np.testing.assert_array_equal(env.air.bytes_sent[0, 1], sent[1])
+    assert (env.air.bytes_sent[0, [0, 2]].sum(axis=1) > sent[[0, 2]].sum(axis=1)).all()
+    np.testing.assert_array_equal(env.maps.layers[0, 1], layers[1])
+    assert (env.maps.layers[0, 0, 2] != layers[0, 2]).any()
 
 
 @pytest.mark.parametrize("level", ["3", "6"])
@@ -314,14 +263,28 @@ def test_wrong_actions_and_settings_are_refused_by_name() -> None:
     env.reset()
     with pytest.raises(InputError, match=r"actions are \(1, 2, 3\), expected \(1, 2, 2\)"):
         env.step(np.zeros((1, 2, 3), np.float32))
-    with pytest.raises(InputError, match="level 3: the action of drone 1 in world 0"):
-        env.step(np.array([[[0, 0], [0, np.nan]]], np.float32))
+    x, y, _ = env.twin.poses[0, 1]
+    where = rf"level 3: the action of drone 1 in world 0, at \({x:.2f}, {y:.2f}\), is not finite"
+    for wrong in (np.nan, np.inf, -np.inf):
+        with pytest.raises(InputError, match=where):
+            env.step(np.array([[[0, 0], [0, wrong]]], np.float32))
+    assert env.ticks[0] == 0  # nothing was flown
     with pytest.raises(InputError, match="level_weights"):
         Exploration(settings(level_weights=(1.0, 2.0)), seed=0)
     with pytest.raises(InputError, match="unknown level '9'"):
         Exploration(settings(levels=("9",)), seed=0)
     with pytest.raises(ValueError, match="unknown LiDAR"):
         settings(lidar="none")
+    with pytest.raises(ValueError, match="drones"):
+        settings(drones=17)
+
+
+def test_more_drones_than_a_level_has_room_for_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "closet.yaml").write_text("{size_m: [2, 2], launch: [1, 1]}")
+    closet = str(tmp_path / "closet.yaml")
+    assert Exploration(settings(levels=(closet,)), seed=0).drones == 2
+    with pytest.raises(InputError, match=r"closet.*: room for \d+ drones around .*, not 16: .* take fewer, or a larger"):
+        Exploration(settings(levels=(closet,), drones=16), seed=0)
 
 
 def test_level_weights_are_shares_of_the_episodes() -> None:

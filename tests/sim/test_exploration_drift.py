@@ -60,7 +60,7 @@ def test_a_world_alone_drifts_as_in_a_batch_over_several_episodes() -> None:
 def western_wall_m(env: Exploration) -> float:
     """Where a drone's own map has the western wall of level 0, which stands at 0 m."""
     layer = env.maps.layers[0, 0, 0]
-    rows, columns = np.nonzero(layer > 0)
+    _, columns = np.nonzero(layer > 0)
     x = (columns + env.maps.origins[0, 0] + 0.5) * CELL
     return float(np.median(x[x < 0.8]))
 

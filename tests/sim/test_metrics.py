@@ -16,6 +16,7 @@ from imagine.sim import metrics
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.metrics import SAMPLE_TICKS, EpisodeMetrics, EpisodeTotals, Recorder, first_at_least
+from imagine.sim.radio import RadioSettings
 
 COVERABLE = 1000
 
@@ -61,7 +62,7 @@ def totals(discovered: Any, **changes: Any) -> EpisodeTotals:
     zeros = np.zeros(drones, np.int64)
     given: dict[str, Any] = {
         "level": "x", "coverable": COVERABLE, "seen": 1, "discovered": np.asarray(discovered, np.int64), "known": zeros,
-        "contacts": zeros, "tiles_sent": zeros,
+        "contacts": zeros,
     }  # fmt: skip
     return EpisodeTotals(**(given | changes))
 
@@ -156,7 +157,8 @@ def test_a_coverage_of_just_the_share_counts() -> None:
 
 def test_exploration_tells_what_can_be_seen_from_outside() -> None:
     explored = ExplorationSettings(
-        levels=("1",), worlds=2, drones=2, mirror=False, episode_ticks=45, stop_coverage=1.0, radio_range_m=1.5
+        levels=("1",), worlds=2, drones=2, mirror=False, episode_ticks=45, stop_coverage=1.0,
+        radio=RadioSettings(range_m=1.5),
     )
     env = Exploration(explored, seed=5, restart=False)
     env.reset()
@@ -180,6 +182,14 @@ def test_exploration_tells_what_can_be_seen_from_outside() -> None:
         assert told.coverage == pytest.approx(told.discovered.sum() / env.maps.coverable_cells[told.world], rel=1e-6)
         assert (told.known >= told.discovered).all()
         assert 1.0 <= told.overlap <= 2.0
+        assert told.bytes_by is not None
+        assert told.cells_by is not None
+        np.testing.assert_array_equal(told.bytes_by, env.air.bytes_sent[told.world])
+        assert (told.bytes_by > 0).all()
+        believed = (env.maps.belief[told.world] != 0).sum(axis=(1, 2))
+        assert (told.cells_by.sum(axis=1) >= believed).all()
+        assert (told.cells_by[:, 0] <= told.known).all()
+        assert (told.cells_by > 0).any(axis=0)[:2].all()  # of own scans, and of peers'
 
 
 def test_contacts_are_told_by_kind_as_the_twin_counts_them() -> None:

@@ -23,7 +23,7 @@ title: two rooms, somebody in the one and a crate in the other
 outline: [[0, 0], [10, 0], [10, 4], [7, 6], [0, 6]]
 launch: [1.2, 1.2]
 walls:
-  - [[5, 0], [5, 6]]
+  - [[5, 0], [5, 5.2]]
 boxes:
   - {center: [3.5, 0.9], size: [0.8, 0.8]}
 circles:
@@ -38,7 +38,7 @@ PX = 900
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Exploration:
-    """Two drones that have looked round the left room; nothing opens into the right one."""
+    """Two drones that have looked round the left room; the way into the right one is out of their scans' range."""
     level = tmp_path_factory.mktemp("levels") / "rooms.yaml"
     level.write_text(ROOMS)
     env = Exploration(

@@ -1,4 +1,4 @@
-"""A served twin is as its settings and its level say: people and crates move in it, airframes, LiDARs and radios differ."""
+"""A served twin is as its settings and its level say: people, crates, airframes, LiDARs and radios."""
 
 from __future__ import annotations
 
