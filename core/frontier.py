@@ -192,7 +192,7 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
     heads, entry_cell, entry_next = scratch
     width = cost.shape[1]
     costs, flat_kinds = cost.ravel(), kinds.ravel()
-    entries, lowest = 0, FAR
+    entries, lowest = 0, np.int64(FAR)
     for k in range(count):
         cell = dirty[k]
         old = np.int64(costs[cell])
@@ -202,14 +202,14 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
             entries += 1
             lowest = min(lowest, old)
     count = _drop_unsupported(costs, flat_kinds, np.uint32(width), lowest, entries, dirty, count, is_dirty, scratch)
-    entries, lowest = 0, FAR
+    entries, lowest = 0, np.int64(FAR)
     for k in range(count):
         cell = np.uint32(dirty[k])
         is_dirty[cell] = 0
         kind = flat_kinds[cell]
         if not kind & np.uint8(_OPEN):
             continue
-        found = 0 if kind & np.uint8(_FRONTIER) else _least(costs, flat_kinds, cell, np.uint32(width))
+        found = np.int64(0) if kind & np.uint8(_FRONTIER) else _least(costs, flat_kinds, cell, np.uint32(width))
         if found < costs[cell]:
             costs[cell] = found
             entry_cell[entries], entry_next[entries], heads[found] = cell, heads[found], entries
@@ -411,7 +411,7 @@ def fill_distance(cost, distance):  # type: ignore[no-untyped-def]
 def cost_at(cost, column, row):  # type: ignore[no-untyped-def]
     """Return the cost at a planning cell of the unpadded grid, or the least within two cells where it has none; FAR."""
     rows, columns = cost.shape[0] - 2 * PAD, cost.shape[1] - 2 * PAD
-    best = FAR
+    best = np.int64(FAR)
     for ring in range(3):
         for i in range(max(0, row - ring), min(rows, row + ring + 1)):
             for j in range(max(0, column - ring), min(columns, column + ring + 1)):

@@ -24,7 +24,8 @@ _LONG_AGO_S = -1e3
 def hand_over_maps(batch: Exploration, world: int, maps: PlainMaps) -> None:
     """Write a world's layers, versions, clocks and coverage into plain maps of the same level."""
     arrays = batch.maps.arrays
-    provisional = batch.air.state.notes[world]["provisional"].reshape(arrays.versions.shape[1:])
+    notes = np.asarray(batch.air.state.notes["provisional"][world], np.bool_)
+    provisional = notes.reshape(arrays.versions.shape[1:])
     rows, columns = maps.tiles
     for drone, own in enumerate(maps.evidence):
         for source in range(batch.drones):
@@ -37,7 +38,7 @@ def hand_over_maps(batch: Exploration, world: int, maps: PlainMaps) -> None:
                 own.layers[source + 1].provisional[at] = True
             own.layers[source + 1].clock = int(versions.max())
         own.layers[drone + 1].clock = int(arrays.clocks[world, drone])
-    maps.seen[...] = arrays.seen[world, : maps.seen.shape[0], : maps.seen.shape[1]]
+    maps.seen[...] = arrays.seen[world][tuple(slice(extent) for extent in maps.seen.shape)]
     maps.discovered[...] = arrays.discovered[world]
     maps.derive()
 
