@@ -38,7 +38,9 @@ def hand_over_maps(batch: Exploration, world: int, maps: PlainMaps) -> None:
                 own.layers[source + 1].provisional[at] = True
             own.layers[source + 1].clock = int(versions.max())
         own.layers[drone + 1].clock = int(arrays.clocks[world, drone])
-    maps.seen[...] = arrays.seen[world][tuple(slice(extent) for extent in maps.seen.shape)]
+    seen: NDArray[np.bool_] = maps.seen
+    height, width = len(seen), len(seen[0])
+    seen[...] = np.asarray(arrays.seen)[world][:height, :width]
     maps.discovered[...] = arrays.discovered[world]
     maps.derive()
 
