@@ -36,8 +36,7 @@ def hand_over_maps(batch: Exploration, world: int, maps: PlainMaps) -> None:
                 at = row + maps.corner.row - own.corner.row, column + maps.corner.column - own.corner.column
                 own.layers[source + 1].provisional[at] = True
             own.layers[source + 1].clock = int(versions.max())
-        own.layers[drone + 1].clock = int(arrays.clocks[world, drone])
-    maps.seen[...] = arrays.seen[world, : maps.seen.shape[0], : maps.seen.shape[1]]
+    maps.seen[...] = arrays.seen[world, : rows * TILE, : columns * TILE]
     maps.discovered[...] = arrays.discovered[world]
     maps.derive()
 
