@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from imagine.core.errors import InputError
+from imagine.kernel_cache import announce_compiling
 from imagine.outputs import check_outputs, write_json
 from imagine.sim.bench import BenchPlan, Results, bench_twin
 from imagine.sim.level import load_level
@@ -33,6 +34,7 @@ def bench_twin_and_show(
         if plot_file.suffix.lower() != ".png":
             raise InputError(f"--plot {plot_file}: the plot is drawn as PNG: name a file that ends in .png")
         check_outputs(plot_file)
+    announce_compiling(lambda text: print(text, file=sys.stderr))
     results = bench_twin(plan, progress=lambda text: print(text, file=sys.stderr))
     results["cores"] = {"value": len(os.sched_getaffinity(0)), "unit": "cores"}
     console = Console()

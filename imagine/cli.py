@@ -44,12 +44,15 @@ app.add_typer(level_app, name="level")
 bench_app = typer.Typer(help="Measure how fast things are here.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(bench_app, name="bench")
 
-_SIM_FLAGS = {"level", "drones", "ticks", "speed", "headless", "seed", "port", "map_file", "lockstep"}
-_DRONE_FLAGS = {"vehicle", "lidar", "mesh", "config", "overrides"}
+_SIM_FLAGS = {"level", "drones", "ticks", "speed", "headless", "seed", "port", "map_file", "lockstep", "twin_file"}
+_DRONE_FLAGS = {"vehicle", "lidar", "mesh", "config"}
 
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="write the results here as JSON")]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="override a setting; may be given many times")
+]
+TwinFile = Annotated[
+    Path | None, typer.Option("--twin", metavar="FILE.yaml", help="the twin's dynamics, sensing and radio")
 ]
 LevelName = Annotated[
     str, typer.Argument(help="0 to 6, house:SEED, a level's YAML, a floor plan's JSON, plan.png@0.05")
@@ -109,7 +112,10 @@ def fly(
     lidar: Annotated[str | None, typer.Option(metavar="URL", help="on a drone: LiDAR, udpin://host:port")] = None,
     mesh: Annotated[str | None, typer.Option(metavar="URL", help="on a drone: the swarm's radio link")] = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE.yaml", help="on a drone: all settings")] = None,
-    overrides: Overrides = None,
+    twin_file: TwinFile = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="override a setting of the drone or the twin")
+    ] = None,
 ) -> None:
     """Fly the team: with --sim in the twin on this machine, with --vehicle one real (or served) drone."""
     if sim == (vehicle is not None or config is not None):
@@ -118,7 +124,7 @@ def fly(
     sources = {name: context.get_parameter_source(name) for name in context.params}
     given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
     for name in sorted(given & (_DRONE_FLAGS if sim else _SIM_FLAGS)):
-        flag = {"map_file": "--map", "overrides": "--set"}.get(name, f"--{name}")
+        flag = {"map_file": "--map", "twin_file": "--twin"}.get(name, f"--{name}")
         why = "is for a drone of its own; --sim wires its drones itself" if sim else "goes with --sim"
         raise InputError(f"fly: {flag} {why}")
     if not sim:
@@ -132,7 +138,7 @@ def fly(
         fly_in_twin(
             processes, _BEGAN, level=level, drones=drones, policy=policy, protocol=_protocol(protocol or "one-hop"),
             ticks=ticks, lockstep=lockstep, speed=speed, headless=headless, seed=seed, port=port,
-            map_file=map_file, json_file=json_file,
+            map_file=map_file, json_file=json_file, twin_file=twin_file, overrides=overrides or [],
         )  # fmt: skip
 
 
@@ -177,14 +183,19 @@ def sim(
     ticks: Annotated[int, typer.Option(min=0, help="serve so long, in tenths of a second; 0: until stopped")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="of sensors, radio and vehicles")] = 0,
     wait: Annotated[float, typer.Option(min=0.1, help="seconds for the runners to connect")] = 600.0,
+    twin_file: TwinFile = None,
+    overrides: Overrides = None,
 ) -> None:
     """Serve the twin (vehicles, LiDARs, radio) for runners elsewhere: hardware in the loop."""
+    from imagine.core.config import load_settings
+    from imagine.sim.twin_settings import TwinSettings
     from imagine.sim_command import ServeOptions, serve_twin
 
     serve_twin(
         ServeOptions(
             level=level, drones=drones, base_port=base_port, host=host, runner_host=runners, lockstep=lockstep,
             speed=speed, mesh=mesh, ticks=ticks, seed=seed, wait_s=wait,
+            twin=load_settings(TwinSettings, twin_file, overrides or []),
         )
     )  # fmt: skip
 
@@ -215,9 +226,11 @@ def train(
     _needs("torch", "train")
     from rich.console import Console
 
+    from imagine.kernel_cache import announce_compiling
     from imagine.train.report import LiveReporter, LogReporter
     from imagine.train.trainer import train as run_training
 
+    announce_compiling(lambda text: print(text, file=sys.stderr))
     console = Console()
     with contextlib.ExitStack() as stack:
         report = stack.enter_context(LiveReporter(console)) if console.is_terminal else LogReporter()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from imagine.core.config import load_settings
 from imagine.core.errors import WorkError
 from imagine.fly_sim import FlyOptions, Watcher, fly_sim
 from imagine.gcs.snapshot import FleetSnapshot
@@ -19,6 +21,7 @@ from imagine.onboard.settings import DEFAULT_POLICY
 from imagine.outputs import write_json
 from imagine.runner_processes import RunnerProcesses
 from imagine.sim.server import TickRecord
+from imagine.sim.twin_settings import TwinSettings
 
 _LINE_TICKS = 100
 
@@ -63,6 +66,8 @@ def fly_in_twin(
     port: int,
     map_file: Path | None,
     json_file: Path | None,
+    twin_file: Path | None,
+    overrides: Sequence[str],
 ) -> None:
     """Fly, show and write the outcome. Raises WorkError, after all is shown, where a drone failed."""
     options = FlyOptions(
@@ -77,6 +82,7 @@ def fly_in_twin(
         seed=seed,
         port=port,
         map_image=map_file,
+        twin=load_settings(TwinSettings, twin_file, overrides),
     )
     console = Console(soft_wrap=not sys.stdout.isatty())  # a file or a pipe has no width
     if console.is_terminal and not headless:

@@ -7,12 +7,14 @@ a vehicle in the field.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from imagine.core.errors import ImagineError, InputError, WorkError
+from imagine.core.frames import Pose
 from imagine.first_start import compile_kernels, warm_twin
 from imagine.flight_ground import FlightGround
 from imagine.flight_results import FlightLog, results
@@ -20,12 +22,14 @@ from imagine.flown_map import draw_flown_map
 from imagine.gcs.snapshot import FleetSnapshot
 from imagine.mesh_comm.settings import MeshSettings, Protocol
 from imagine.onboard.build import load_policy
+from imagine.onboard.odometry_settings import OdometrySettings
 from imagine.onboard.settings import DEFAULT_POLICY, DroneSettings, LaunchPose
 from imagine.runner_processes import RunnerProcesses
 from imagine.sim.coverage import Coverage
 from imagine.sim.level import load_level
 from imagine.sim.server import SitlServer, SitlSettings, TickRecord
 from imagine.sim.twin import Twin
+from imagine.sim.twin_settings import TwinSettings
 from imagine.stop_signals import StopSignals
 
 _CONNECT_S = 60.0
@@ -50,6 +54,7 @@ class FlyOptions:
     seed: int = 0
     port: int = 8770
     map_image: Path | None = None
+    twin: TwinSettings = field(default_factory=TwinSettings)
 
 
 class Watcher:
@@ -77,8 +82,10 @@ def fly_sim(options: FlyOptions, processes: RunnerProcesses, watcher: Watcher, b
     with ExitStack() as stack:
         stopping = stack.enter_context(StopSignals())
         level = load_level(options.level)
-        twin = Twin([level], options.drones, seed=options.seed)
-        settings = _drone_settings(options, level.launch_poses(options.drones))
+        twin = Twin(
+            [level], options.drones, seed=options.seed, dynamics=options.twin.dynamics, sensing=options.twin.sensing
+        )
+        settings = drone_settings(options, level.launch_poses(options.drones))
         load_policy(settings[0])  # refuses a model that does not fit
         ground: FlightGround | None = None
         if not options.headless:
@@ -89,6 +96,7 @@ def fly_sim(options: FlyOptions, processes: RunnerProcesses, watcher: Watcher, b
             lockstep=options.lockstep,
             speed=options.speed,
             reply_timeout_s=_LOCKSTEP_REPLY_S if options.lockstep else 1.5,
+            radio=options.twin.radio,
         )
         server = stack.enter_context(SitlServer(twin, sitl, options.seed, processes.is_running))
         processes.fly(
@@ -181,14 +189,17 @@ def _moves(record: TickRecord) -> bool:
     return lifted or bool(abs(record.velocities[:, :2]).max() > _MOTION_MPS)
 
 
-def _drone_settings(options: FlyOptions, poses: list[Any]) -> list[DroneSettings]:
+def drone_settings(options: FlyOptions, poses: Sequence[Pose]) -> list[DroneSettings]:
+    """Return what each drone of the flight is given, from number 1 on, before it is wired."""
     radio = MeshSettings(protocol=options.protocol)
+    odometry = OdometrySettings(deskew=options.twin.sensing.skew)
     return [
         DroneSettings(
             drone_id=number,
             policy=options.policy,
             launch=LaunchPose(x=pose.x, y=pose.y, yaw=pose.yaw),
             radio=radio,
+            odometry=odometry,
             lockstep=options.lockstep,
             stay=True,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rich.console import Console
 
@@ -15,6 +15,7 @@ from imagine.sim.drone_edge import Endpoint
 from imagine.sim.level import load_level
 from imagine.sim.server import SitlServer, SitlSettings, TickRecord
 from imagine.sim.twin import Twin
+from imagine.sim.twin_settings import TwinSettings
 from imagine.stop_signals import StopSignals
 
 _LINE_TICKS = 100
@@ -35,6 +36,7 @@ class ServeOptions:
     ticks: int = 0
     seed: int = 0
     wait_s: float = 600.0
+    twin: TwinSettings = field(default_factory=TwinSettings)
 
 
 def serve_twin(options: ServeOptions) -> None:
@@ -45,7 +47,9 @@ def serve_twin(options: ServeOptions) -> None:
     console = Console(highlight=False, soft_wrap=True)
     level = load_level(options.level)
     poses = level.launch_poses(options.drones)
-    twin = Twin([level], options.drones, seed=options.seed)
+    twin = Twin(
+        [level], options.drones, seed=options.seed, dynamics=options.twin.dynamics, sensing=options.twin.sensing
+    )
     settings = SitlSettings(
         lockstep=options.lockstep,
         speed=options.speed,
@@ -54,11 +58,12 @@ def serve_twin(options: ServeOptions) -> None:
         runner_host=options.runner_host,
         port_base=options.base_port,
         ground_modem=options.mesh,
+        radio=options.twin.radio,
     )
     with StopSignals() as stopping, SitlServer(twin, settings, options.seed) as server:
         warm_twin()  # before anyone waits for a tick
         for endpoint, pose in zip(server.endpoints, poses, strict=True):
-            console.print(f"drone {endpoint.drone}: {runner_command(endpoint, pose, options.lockstep)}")
+            console.print(f"drone {endpoint.drone}: {runner_command(endpoint, pose, options)}")
         if server.ground_endpoint is not None:
             console.print(f"ground station: imagine gcs --mesh {server.ground_endpoint}")
             console.print(
@@ -81,7 +86,7 @@ def serve_twin(options: ServeOptions) -> None:
         _raise_lost(record)
 
 
-def runner_command(endpoint: Endpoint, pose: Pose, lockstep: bool) -> str:
+def runner_command(endpoint: Endpoint, pose: Pose, options: ServeOptions) -> str:
     """Return the command that flies a served drone from its launch pose."""
     words = ["imagine", "fly", "--vehicle", endpoint.vehicle, "--lidar", endpoint.lidar]
     if endpoint.mesh is not None:
@@ -90,8 +95,10 @@ def runner_command(endpoint: Endpoint, pose: Pose, lockstep: bool) -> str:
     if pose.yaw:
         settings["launch.yaw"] = round(pose.yaw, 4)
     words += [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
-    if lockstep:
+    if options.lockstep:
         words += ["--set", "lockstep=true"]
+    if options.twin.sensing.skew:
+        words += ["--set", "odometry.deskew=true"]
     return shlex.join(words)
 
 

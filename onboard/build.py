@@ -19,7 +19,7 @@ from imagine.core.visits import VisitMap
 from imagine.mesh_comm.keys import default_boot_file, find_key, next_boot_number
 from imagine.mesh_comm.node import MeshNode
 from imagine.mesh_comm.seal import KEY_BYTES, Sealer
-from imagine.onboard.perception import Perception
+from imagine.onboard.perception import Perception, PerceptionSettings
 from imagine.onboard.policy import OnnxPolicy, Policy, check_fit
 from imagine.onboard.records import FlightMode, Telemetry, TickInput
 from imagine.onboard.runner import Runner
@@ -36,7 +36,8 @@ def build_runner(settings: DroneSettings, policy: Policy | None, sealer: Sealer 
     mesh = None
     if sealer is not None:
         mesh = MeshNode(evidence, settings.lidar_spec, settings.map.range_cap_m, settings.radio, sealer)
-    return Runner(settings, policy, Perception(settings.lidar_spec, launch=launch), evidence, mesh)
+    perception = Perception(settings.lidar_spec, PerceptionSettings(odometry=settings.odometry), launch)
+    return Runner(settings, policy, perception, evidence, mesh)
 
 
 def load_policy(settings: DroneSettings) -> OnnxPolicy | None:

@@ -14,35 +14,12 @@ from kiss_icp.mapping import VoxelHashMap
 from kiss_icp.registration import Registration
 from kiss_icp.voxelization import voxel_down_sample
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.spatial import KDTree
 
-from imagine.core.config import Settings
-from imagine.core.frames import IDENTITY, Pose, compose, relative, rotate, transform_points, wrap_angle
-from imagine.core.lidar import LidarSpec, Scan, points, returns
-
-
-class OdometrySettings(Settings):
-    """How scans are matched, and what counts as having lost track. The defaults are measured on planar scans."""
-
-    voxel_m: float = Field(default=0.5, gt=0.0, description="side of a voxel of the local map, metres")
-    points_per_voxel: int = Field(
-        default=20, ge=1, description="map points in a voxel; at 100 a sensor noise of 3 cm drifts ten times as far"
-    )
-    source_voxel_m: float = Field(default=0.15, gt=0.0, description="scans are thinned to this before matching, metres")
-    threshold_m: float = Field(default=0.25, gt=0.0, description="ICP kernel; pairs up to three times this are matched")
-    map_radius_m: float = Field(default=50.0, gt=0.0, description="points farther than this are forgotten, metres")
-    max_iterations: int = Field(default=500, ge=1)
-    convergence: float = Field(default=1e-4, gt=0.0)
-    min_points: int = Field(default=12, ge=3, description="fewer thinned points than this cannot be matched")
-    min_overlap: float = Field(default=0.5, ge=0.0, le=1.0, description="share of a scan that must meet the last one")
-    overlap_distance_m: float = Field(default=0.2, gt=0.0, description="points this close count as meeting")
-    max_correction_m: float = Field(default=0.5, gt=0.0, description="a match farther from the guess is wrong")
-    max_speed_mps: float = Field(default=5.0, gt=0.0, description="a faster motion is a wrong match")
-    max_yaw_error_rad: float = Field(default=0.35, gt=0.0, description="largest disagreement with the yaw prior")
-    deskew: bool = Field(
-        default=False, description="beams come one after another: put each where the end of the turn would have seen it"
-    )
+from imagine.core.frames import IDENTITY, Pose, compose, relative, transform_points, wrap_angle
+from imagine.core.lidar import LidarSpec, Scan, points
+from imagine.onboard.deskewing import deskewed_points
+from imagine.onboard.odometry_settings import OdometrySettings
 
 
 class OdometryResult(NamedTuple):
@@ -86,7 +63,7 @@ class LidarOdometry:
         increments are used. Nothing raises: a scan that cannot be matched gives `ok` false and a reason.
         """
         motion = self._predicted_motion(yaw_prior)
-        cloud = deskewed(scan, self.spec, motion) if self.settings.deskew else points(scan, self.spec)
+        cloud = deskewed_points(scan, self.spec, motion) if self.settings.deskew else points(scan, self.spec)
         source = _thin(cloud, self.settings.source_voxel_m)
         guess = compose(self.pose, motion)
         elapsed = 0.0 if self._stamp is None else scan.stamp - self._stamp
@@ -154,20 +131,6 @@ class LidarOdometry:
         if overlap < s.min_overlap:
             return f"only {overlap:.0%} of the scan meets the last one, needs {s.min_overlap:.0%}"
         return None
-
-
-def deskewed(scan: Scan, spec: LidarSpec, motion: Pose) -> NDArray[np.float64]:
-    """Return the hit points `[hits, 2]` in the body frame at the scan's stamp, the end of its turn, metres.
-
-    `motion` is the drone's from one stamp to the next, in the frame of the former; it is taken as uniform over the
-    turn, as KISS-ICP does. Beam i of n was taken (1 − i / n) of the turn before the stamp.
-    """
-    cloud, hit = points(scan, spec), np.flatnonzero(returns(scan, spec))
-    left = (1.0 - hit / spec.beams) * spec.fov / (2.0 * math.pi)
-    back_x, back_y = rotate(-motion.yaw, -motion.x, -motion.y)
-    c, s = np.cos(-motion.yaw * left), np.sin(-motion.yaw * left)
-    x, y = cloud.T
-    return np.column_stack((c * x - s * y + left * back_x, s * x + c * y + left * back_y))
 
 
 def _thin(cloud: NDArray[np.float64], voxel_m: float) -> NDArray[np.float64]:

@@ -11,8 +11,10 @@ from pydantic import Field
 from imagine.core.config import Settings
 from imagine.core.frames import IDENTITY, Pose, wrap_angle
 from imagine.core.lidar import LidarSpec, Scan
+from imagine.onboard.deskewing import deskewed_scan
 from imagine.onboard.estimator import Estimator, EstimatorSettings
-from imagine.onboard.odometry import LidarOdometry, OdometryResult, OdometrySettings
+from imagine.onboard.odometry import LidarOdometry, OdometryResult
+from imagine.onboard.odometry_settings import OdometrySettings
 
 
 class PerceptionSettings(Settings):
@@ -27,7 +29,8 @@ class PerceptionResult(NamedTuple):
     """Where the drone is at `stamp`, map frame: pose, velocity (m/s), yaw rate (rad/s), variances of x, y, yaw, vx, vy.
 
     `ok` is false, and `reason` says why, when the scan added nothing: the pose is then a prediction and must not be
-    used to draw the scan into the map. `lost` is true when that has lasted too long to go on flying by it.
+    used to draw the scan into the map. `lost` is true when that has lasted too long to go on flying by it. `scan` is
+    what maps are drawn from: the scan as the end of its turn would have seen it, or as it came where nothing deskews.
     """
 
     stamp: float
@@ -39,6 +42,7 @@ class PerceptionResult(NamedTuple):
     lost: bool
     reason: str | None
     odometry: OdometryResult
+    scan: Scan
 
 
 class Perception:
@@ -49,6 +53,8 @@ class Perception:
         self.settings = settings or PerceptionSettings()
         self.odometry = LidarOdometry(spec, self.settings.odometry, launch)
         self.estimator = Estimator(launch, self.settings.estimator)
+        self._spec = spec
+        self._stamp: float | None = None
         self._yaw_prior: float | None = None
         self._failed_in_a_row = 0
 
@@ -64,6 +70,8 @@ class Perception:
         if odometry.ok:
             reason = self.estimator.update_odometry(odometry.pose)
         self._failed_in_a_row = 0 if reason is None else self._failed_in_a_row + 1
+        mapped = self._deskewed(scan, odometry.delta) if self.settings.odometry.deskew else scan
+        self._stamp = scan.stamp
         estimate = self.estimator.estimate
         return PerceptionResult(
             stamp=scan.stamp,
@@ -75,4 +83,12 @@ class Perception:
             lost=self._failed_in_a_row >= self.settings.lost_after,
             reason=reason,
             odometry=odometry,
+            scan=mapped,
         )
+
+    def _deskewed(self, scan: Scan, delta: Pose) -> Scan:
+        """Put a scan right by what the drone did since the last one, which may be several turns ago."""
+        if self._stamp is None:
+            return scan
+        share = min(1.0, 1.0 / (self._spec.rate_hz * (scan.stamp - self._stamp)))
+        return deskewed_scan(scan, self._spec, Pose(delta.x * share, delta.y * share, delta.yaw * share))

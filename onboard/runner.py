@@ -134,9 +134,9 @@ class Runner:
 
     def _map(self, where: PerceptionResult | None, inputs: TickInput) -> Mapped | None:
         """Own evidence, drawn without the teammates the LiDAR sees, then the frontiers of the team's belief."""
-        scan = inputs.scan
-        if where is None or scan is None:
+        if where is None:
             return None
+        scan = where.scan
         belief = self.evidence.belief()
         new_cells = 0
         if where.ok:

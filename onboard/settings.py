@@ -12,6 +12,7 @@ from imagine.core.lidar import PRESETS, LidarSpec
 from imagine.core.mapping import MapSettings
 from imagine.core.vehicle_limits import VehicleLimits
 from imagine.mesh_comm.settings import MeshSettings
+from imagine.onboard.odometry_settings import OdometrySettings
 
 DEFAULT_POLICY = Path(__file__).parent / "policies" / "explore.onnx"
 """The policy that is shipped with the project."""
@@ -80,6 +81,7 @@ class DroneSettings(Settings):
     launch: LaunchPose = LaunchPose()
     limits: VehicleLimits = VehicleLimits()
     map: MapSettings = MapSettings()
+    odometry: OdometrySettings = OdometrySettings()
     flight: FlightSettings = FlightSettings()
     ladder: LadderSettings = LadderSettings()
     lockstep: bool = False

@@ -91,6 +91,23 @@ def deliver(air, world, tick, key, poses, alive, segments, layers, versions, dir
 
 
 @numba.njit(cache=True, nogil=True)
+def meet(air, world, tick, poses):  # type: ignore[no-untyped-def]
+    """Let drones that reach each other know of one another at `poses` (`[drones, 3]`), where an episode begins.
+
+    In flight they have told their status, over and over, before they take off; an episode begins in the air.
+    """
+    drones = poses.shape[0]
+    for holder in range(drones):
+        for other in range(drones):
+            if air.reach[world, holder, other]:
+                peer = air.peers[world, holder, other]
+                peer.heard_tick = peer.pose_tick = tick
+                peer.x, peer.y, peer.yaw = poses[other, 0], poses[other, 1], poses[other, 2]
+                for heard in range(drones):
+                    peer.hears |= np.int64(air.reach[world, other, heard]) << heard
+
+
+@numba.njit(cache=True, nogil=True)
 def claim_own(air, world, layers):  # type: ignore[no-untyped-def]
     """Bring the count of cells known by own scans up to date for every drone of a world; before it is read."""
     for drone in range(layers.shape[0]):

@@ -16,15 +16,17 @@ from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
 from imagine.core.lidar import TEAMMATE_RADIUS_M
+from imagine.core.raster import TILE
 from imagine.sim.air import Air
 from imagine.sim.air_receive import claim_own
 from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
 from imagine.sim.decision_state import DecisionState
 from imagine.sim.exploration_settings import ExplorationSettings
-from imagine.sim.exploration_tick import FLYING, LAUNCHING, STAGES, WAITING, Specs, fly, observe, scan, share
+from imagine.sim.exploration_tick import FLYING, LAUNCHING, STAGES, WAITING, Specs, fly, locate, observe, scan, share
 from imagine.sim.keyed_noise import root_keys
 from imagine.sim.level import Level, load_level, mirrored
 from imagine.sim.metrics import EpisodeMetrics, EpisodeTotals, Recorder
+from imagine.sim.odometry_drift import OdometryDrift
 from imagine.sim.planner_actions import plan_worlds
 from imagine.sim.reward import rewards, survivors, sweep_cells
 from imagine.sim.team_maps import Scratch, TeamMaps, derive
@@ -66,7 +68,8 @@ class Exploration:
     """A batch of worlds being explored; finished worlds start anew by themselves.
 
     `alive` bool `[worlds, drones]`; `ticks` `[worlds]` of the episodes in progress; `estimates` `[worlds, drones, 3]`
-    what drones take their poses to be.
+    what drones take their poses to be: the true ones, unless `settings.drift` is on. Then they fly, map, tell peers and
+    see by their estimates, and what the team has seen is where their maps put it; physics, rays and radio know better.
     """
 
     dt = TICK_S
@@ -100,7 +103,7 @@ class Exploration:
         cap = settings.map.range_cap_m
         self.maps = TeamMaps(worlds, drones, rows, columns, self.lidar, cap, workers)
         self.air = Air(
-            worlds, drones, *self.maps.versions.shape[3:], settings.radio, settings.mesh, self.lidar, cap, TICK_S
+            worlds, drones, rows // TILE, columns // TILE, settings.radio, settings.mesh, self.lidar, cap, TICK_S
         )
         self.decisions = DecisionState(worlds, drones, rows, columns, settings.observation, settings.action, workers)
         self._recorder = Recorder(worlds, drones, seed)
@@ -110,7 +113,8 @@ class Exploration:
         self._swept = sweep_cells(cap, settings.action.speed_mps, TICK_S)
         self.ranges = np.full((worlds, drones, self.lidar.beams), np.inf, np.float32)
         """The newest turn of every drone's LiDAR, `[worlds, drones, beams]`: metres, inf no return, nan invalid."""
-        self.estimates = self.twin.poses
+        self._drift = OdometryDrift(worlds, drones, settings.drift, TICK_S, workers) if settings.drift.enabled else None
+        self.estimates = self.twin.poses if self._drift is None else self.twin.poses.copy()
         self._specs = _specs(settings, self.decisions)
         self.stage_seconds: dict[str, float] = {}
         self._sight_m = max(cap + 2.0 * TEAMMATE_RADIUS_M, settings.observation.lidar_range_m)
@@ -156,6 +160,8 @@ class Exploration:
         self.ticks[world] = 0
         self._idle[world] = 0
         self._limit[world] = self.settings.episode_ticks
+        if self._drift is not None:
+            self._drift.reset(world, self._generators[world])
         self._recorder.begin(world, self.twin.poses[world])
 
     def step(self, actions: NDArray[np.float32]) -> Step:
@@ -214,13 +220,14 @@ class Exploration:
         return earned
 
     def _run(self, modes: NDArray[np.int64], shown: NDArray[np.int64]) -> None:
-        """Run a tick in all worlds, as `modes` says for each, and observe those whose mode in `shown` is not WAITING."""
+        """Run a tick in all worlds, as `modes` says for each; observe those whose mode in `shown` is not WAITING."""
         observes = bool((shown != WAITING).any())
         twin = self.twin
         sensors, flight = twin.sensors(self._sight_m), twin.kernel_args()
         levels = sensors.levels, sensors.rows
         seen = self._observed[self._now]
         maps, air = self.maps.arrays, self.air.state
+        drift = None if self._drift is None else self._drift.kernel_args()
 
         def run_part(first: int, last: int, scratch: Scratch) -> None:
             lap = self._lap()
@@ -228,6 +235,8 @@ class Exploration:
                 first, last, modes, self.decisions.intents, self._setpoints, self.ranges, self.estimates, twin.alive,
                 self._specs, flight,
             )  # fmt: skip
+            if drift is not None:
+                locate(first, last, modes, self.estimates, twin.poses, drift)
             lap("fly")
             scan(
                 first, last, modes, self._turns, self.ranges, sensors, twin.poses, twin.velocity, twin.alive,

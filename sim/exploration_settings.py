@@ -15,6 +15,7 @@ from imagine.core.vehicle_limits import VehicleLimits
 from imagine.mesh_comm.settings import MeshSettings, Protocol
 from imagine.sim.dynamics import DynamicsSettings
 from imagine.sim.lidar_model import LidarModel
+from imagine.sim.odometry_drift import DriftSettings
 from imagine.sim.radio import RadioSettings
 from imagine.sim.reward import RewardSettings
 
@@ -44,6 +45,7 @@ class ExplorationSettings(Settings):
     reward: RewardSettings = RewardSettings()
     dynamics: DynamicsSettings = DynamicsSettings()
     sensing: LidarModel = LidarModel()
+    drift: DriftSettings = DriftSettings()
 
     @field_validator("lidar")
     @classmethod

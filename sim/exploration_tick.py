@@ -18,8 +18,9 @@ from imagine.core.action import Parameters, body_velocity_kernel
 from imagine.core.observation import MOTION, fill_motion, fill_sectors, fill_views
 from imagine.core.raster import CELL
 from imagine.core.shield import shield_kernel
-from imagine.sim.air_receive import deliver, peer_place
+from imagine.sim.air_receive import deliver, meet, peer_place
 from imagine.sim.air_send import canvas, send
+from imagine.sim.odometry_drift import advance_worlds
 from imagine.sim.physics import step_worlds
 from imagine.sim.scan_world import scan_world
 from imagine.sim.team_maps import integrate_scan_of
@@ -72,6 +73,15 @@ def fly(first, last, modes, intents, setpoints, ranges, estimates, alive, specs,
 
 
 @numba.njit(cache=True, nogil=True)
+def locate(first, last, modes, estimates, poses, drift):  # type: ignore[no-untyped-def]
+    """Carry what drones take their `poses` to be on by a tick; `drift` is `OdometryDrift.kernel_args()`."""
+    error, before, scale, drawn, ages, numbers, normal = drift
+    for world in range(first, last):
+        if modes[world] != WAITING:
+            advance_worlds(world, world + 1, estimates, poses, error, before, scale, drawn, ages, numbers, normal)
+
+
+@numba.njit(cache=True, nogil=True)
 def scan(first, last, modes, turns, ranges, sensors, poses, velocity, alive, discs, edges, radius):  # type: ignore[no-untyped-def]
     """Take a turn of every LiDAR, as `scan_world`; `turns` int64 `[worlds]` counts them, and draws their noise."""
     for world in range(first, last):
@@ -99,6 +109,8 @@ def share(first, last, modes, ticks, keys, poses, velocity, estimates, alive, ra
             air, world, tick, keys[world], poses[world], alive[world], walls, maps.layers[world], maps.versions[world],
             maps.dirty[world],
         )  # fmt: skip
+        if modes[world] == LAUNCHING:
+            meet(air, world, tick, estimates[world])
         for drone in range(drones):
             maps.gained[world, drone] = maps.changed[world, drone] = 0
             if not alive[world, drone]:

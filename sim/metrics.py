@@ -22,9 +22,9 @@ class EpisodeTotals:
     """What the counters of one world stand at when its episode ends; the recorder keeps none of these itself.
 
     Per drone: `discovered` int `[drones]`, coverable cells it was the first to see; `known` int `[drones]`, cells it
-    knows from its own sensor; `contacts` int `[drones]`, or `[drones, 3]` by CONTACT_KINDS; `bytes_by` int
-    `[drones, 4]` by BYTE_KINDS and `cells_by` int `[drones, 3]` by CELL_SOURCES, None where the radio keeps no such
-    account. Of the team: `seen` cells, and the level's `coverable` ones.
+    knows from its own sensor; `contacts` int `[drones, 3]` by CONTACT_KINDS; `bytes_by` int `[drones, 4]` by
+    BYTE_KINDS and `cells_by` int `[drones, 3]` by CELL_SOURCES. Of the team: `seen` cells, and the level's `coverable`
+    ones.
     """
 
     level: str
@@ -33,8 +33,8 @@ class EpisodeTotals:
     discovered: NDArray[np.int64]
     known: NDArray[np.int64]
     contacts: NDArray[np.int64]
-    bytes_by: NDArray[np.int64] | None = None
-    cells_by: NDArray[np.int64] | None = None
+    bytes_by: NDArray[np.int64]
+    cells_by: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -73,17 +73,17 @@ class EpisodeMetrics:
     """Ticks in which drone i was linked to drone j, `[drones, drones]`, 0 on the diagonal."""
     alive_ticks: NDArray[np.int64]
     """Ticks after which each drone still flew, `[drones]`; `ticks` for those that never fell."""
-    contacts_by: NDArray[np.int64] | None = None
-    """`[drones, 3]` by CONTACT_KINDS, None where the twin does not tell them apart."""
-    bytes_by: NDArray[np.int64] | None = None
-    """Bytes each drone sent, `[drones, 4]` by BYTE_KINDS, None where the radio does not count them."""
-    cells_by: NDArray[np.int64] | None = None
-    """Cells by how each drone first came to know them, `[drones, 3]` by CELL_SOURCES, None where not counted."""
+    contacts_by: NDArray[np.int64]
+    """`contacts` of each drone, `[drones, 3]` by CONTACT_KINDS."""
+    bytes_by: NDArray[np.int64]
+    """Bytes each drone sent, `[drones, 4]` by BYTE_KINDS."""
+    cells_by: NDArray[np.int64]
+    """Cells by how each drone first came to know them, `[drones, 3]` by CELL_SOURCES."""
 
     @property
-    def total_bytes(self) -> int | None:
-        """Bytes the team sent, None where the radio does not count them."""
-        return None if self.bytes_by is None else int(self.bytes_by.sum())
+    def total_bytes(self) -> int:
+        """Bytes the team sent."""
+        return int(self.bytes_by.sum())
 
     @property
     def link_share(self) -> float:
@@ -157,7 +157,6 @@ class Recorder:
         curve = self._curves[world, :ticks].copy()
         samples = self._samples[world, :, : -(-ticks // SAMPLE_TICKS)].astype(np.float64)
         samples[:, -1] = totals.discovered
-        by_kind = totals.contacts.ndim == 2
         return EpisodeMetrics(
             world=world,
             seed=self.seed,
@@ -177,9 +176,9 @@ class Recorder:
             link_ticks=self._links[world].copy(),
             pair_ticks=self._pairs[world].copy(),
             alive_ticks=self._alive_ticks[world].copy(),
-            contacts_by=totals.contacts.copy() if by_kind else None,
-            bytes_by=None if totals.bytes_by is None else totals.bytes_by.copy(),
-            cells_by=None if totals.cells_by is None else totals.cells_by.copy(),
+            contacts_by=totals.contacts.copy(),
+            bytes_by=totals.bytes_by.copy(),
+            cells_by=totals.cells_by.copy(),
         )
 
 

@@ -18,8 +18,6 @@ from imagine.sim.metrics import BYTE_KINDS, CONTACT_KINDS, EpisodeMetrics
 from imagine.train.policies import Policy, load_policy
 
 MAX_WORLDS = 16
-BYTES_PER_TILE = 150
-"""What a tile of the evidence map is taken to cost on the air where the radio counts tiles and no bytes; assumed."""
 _RESAMPLES = 2000
 
 
@@ -135,7 +133,7 @@ def row(
     """Return the means over episodes as a row.
 
     An episode that never reaches a coverage counts with its full length. `productivity_ratio` is the geometric mean,
-    as becomes ratios; what a drone sent is estimated from its tiles where the radio counts no bytes.
+    as becomes ratios.
     """
     coverage = np.array([episode.coverage for episode in episodes])
     row: dict[str, Any] = {
@@ -154,32 +152,15 @@ def row(
     row["overlap"] = float(np.mean([episode.overlap for episode in episodes]))
     row["collisions_per_episode"] = float(np.mean([episode.contacts for episode in episodes]))
     row["path_m"] = float(np.mean([episode.path_m.mean() for episode in episodes]))
-    sent = np.mean([_sent(episode).mean(axis=0) for episode in episodes], axis=0)
+    sent = np.mean([episode.bytes_by.mean(axis=0) for episode in episodes], axis=0)
     row["bytes_per_drone"] = float(sent.sum())
     row["bytes_sent"] = dict(zip(BYTE_KINDS, sent.tolist(), strict=True))
-    row["collisions_by_kind"] = _contacts_by_kind(episodes)
+    contacts = np.mean([episode.contacts_by.sum(axis=0) for episode in episodes], axis=0)
+    row["collisions_by_kind"] = dict(zip(CONTACT_KINDS, contacts.tolist(), strict=True))
     row["productivity_ratio"] = float(np.exp(np.mean([np.log(episode.productivity_ratio) for episode in episodes])))
     row["link_share"] = float(np.mean([episode.link_share for episode in episodes]))
     row["survivors"] = float(np.mean([(episode.alive_ticks == episode.ticks).mean() for episode in episodes]))
     return row
-
-
-def _sent(episode: EpisodeMetrics) -> NDArray[np.float64]:
-    """Return the bytes each drone sent, `[drones, 4]` by BYTE_KINDS."""
-    if episode.bytes_by is not None:
-        return episode.bytes_by.astype(np.float64)
-    sent = np.zeros((len(episode.tiles_sent), len(BYTE_KINDS)))
-    sent[:, BYTE_KINDS.index("tile")] = BYTES_PER_TILE * episode.tiles_sent
-    return sent
-
-
-def _contacts_by_kind(episodes: Sequence[EpisodeMetrics]) -> dict[str, float] | None:
-    """Return the team's contacts an episode by CONTACT_KINDS, None where an episode does not tell them apart."""
-    known = [episode.contacts_by for episode in episodes if episode.contacts_by is not None]
-    if len(known) < len(episodes):
-        return None
-    means = np.mean([contacts.sum(axis=0) for contacts in known], axis=0)
-    return dict(zip(CONTACT_KINDS, means.tolist(), strict=True))
 
 
 def bootstrap_interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from imagine.core.errors import WorkError
 from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.metrics import EpisodeMetrics
 from imagine.train.networks import Actor
-from imagine.train.rollout import OBSERVATION_KEYS, actor_inputs, agent_tensors, env_actions
+from imagine.train.rollout import OBSERVATION_KEYS, actor_inputs, env_actions, policy_tensors
 
 
 class ImitationSettings(Settings):
@@ -88,7 +88,7 @@ def collect_labels(
     episodes: list[EpisodeMetrics] = []
     added = 0
     for _ in range(steps):
-        tensors = agent_tensors(observation)
+        tensors = policy_tensors(observation)
         labels = torch.from_numpy(env.planner_actions().reshape(len(planner_flies), -1))
         labelled = torch.isfinite(labels).all(dim=1)
         buffer.add({key: tensors[key][labelled] for key in OBSERVATION_KEYS}, labels[labelled])

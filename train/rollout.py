@@ -43,10 +43,16 @@ class Rollout:
         return int(self.alive.sum())
 
 
-def agent_tensors(observation: Observation) -> dict[str, Tensor]:
-    """Return an observation's arrays `[worlds, drones, ...]` as tensors `[agents, ...]`, the critic's as `level`."""
-    arrays = {**{key: observation.policy[key] for key in OBSERVATION_KEYS}, "level": observation.critic}
+def policy_tensors(observation: Observation) -> dict[str, Tensor]:
+    """Return what the policy sees, `[worlds, drones, ...]`, as tensors `[agents, ...]`, good as long as it is."""
+    arrays = {key: observation.policy[key] for key in OBSERVATION_KEYS}
     return {key: torch.from_numpy(array.reshape(-1, *array.shape[2:])) for key, array in arrays.items()}
+
+
+def agent_tensors(observation: Observation) -> dict[str, Tensor]:
+    """Return `policy_tensors`, and the images of the critic's own as `level`."""
+    level = observation.critic
+    return {**policy_tensors(observation), "level": torch.from_numpy(level.reshape(-1, *level.shape[2:]))}
 
 
 def actor_inputs(tensors: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:

@@ -24,7 +24,8 @@ _LONG_AGO_S = -1e3
 def hand_over_maps(batch: Exploration, world: int, maps: PlainMaps) -> None:
     """Write a world's layers, versions, clocks and coverage into plain maps of the same level."""
     arrays = batch.maps.arrays
-    provisional = batch.air.state.notes[world]["provisional"].reshape(arrays.versions.shape[1:])
+    notes = np.asarray(batch.air.state.notes["provisional"][world], np.bool_)
+    provisional = notes.reshape(arrays.versions.shape[1:])
     rows, columns = maps.tiles
     for drone, own in enumerate(maps.evidence):
         for source in range(batch.drones):

@@ -93,6 +93,11 @@ def left_running(marker: str) -> list[str]:
         (["fly", "--sim", "--lidar", "udpin://127.0.0.1:1"], ["--lidar", "--sim"]),
         (["fly", "--vehicle", "udpin://127.0.0.1:1", "--level", "3"], ["--level", "--sim"]),
         (["fly", "--vehicle", "tcp://nowhere", "--policy", "frontier"], ["tcp://nowhere"]),
+        (["fly", "--vehicle", "udpin://127.0.0.1:1", "--twin", "twin.yaml"], ["--twin", "--sim"]),
+        ([*HEADLESS, "--set", "sensing.skw=true"], [r"unknown key 'sensing\.skw'", "did you mean 'skew'"]),
+        ([*HEADLESS, "--set", "radio"], ["--set radio", "key=value"]),
+        (["sim", "--set", "dynamics.lag_s=[0.3, 0.1]"], [r"dynamics\.lag_s", "range"]),
+        (["sim", "--twin", "missing.yaml"], [r"missing\.yaml", "No such file"]),
         (["nonsense"], ["nonsense"]),
         (["export", "nonsense"], ["nonsense"]),
         (["replay"], ["recording"]),
@@ -155,6 +160,14 @@ def test_a_malformed_config_is_named_by_file_line_and_nearest_key(tmp_path: Path
     path.write_text("drone_id: 2\nmax_flight_s: -1.0\n")
     refused(["fly", "--config", path], r"drone\.yaml:2: max_flight_s", "greater than 0")
     refused(["fly", "--config", tmp_path / "none.yaml"], r"none\.yaml", "No such file")
+
+
+def test_a_malformed_twin_is_named_by_file_line_and_nearest_key(tmp_path: Path) -> None:
+    path = tmp_path / "twin.yaml"
+    path.write_text("dynamics:\n  lag_s: 0.2\n  winds_mps: 0.1\n")
+    refused([*HEADLESS, "--twin", path], r"twin\.yaml:3: unknown key 'dynamics\.winds_mps'; did you mean 'wind_mps'")
+    path.write_text("radio:\n  loss: 1.5\n")
+    refused(["sim", "--twin", path], r"twin\.yaml:2: radio\.loss", "less than or equal to 1")
 
 
 def test_models_that_cannot_fly_are_refused(tmp_path: Path) -> None:

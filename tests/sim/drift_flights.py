@@ -19,7 +19,7 @@ from imagine.core.lidar import LD19, Scan
 from imagine.core.planner import plan_velocity
 from imagine.core.shield import shield_velocity
 from imagine.core.vehicle_limits import VehicleLimits
-from imagine.onboard.odometry import OdometrySettings
+from imagine.onboard.odometry_settings import OdometrySettings
 from imagine.onboard.perception import Perception, PerceptionSettings
 from imagine.onboard.records import Telemetry
 from imagine.onboard.yaw_prior import YawPrior

@@ -98,7 +98,7 @@ class TeamOnBoard:
         self.env, self.world, self.rules = env, world, env.air.rules
         self.drones = [OnBoard(env, world, drone) for drone in range(env.drones)]
         self.delivered = np.zeros((env.drones, env.drones), np.int64)
-        self.lost = 0
+        self.lost = self.relayed = 0
         self.said = np.zeros(4, np.int64)
         self._sealers = [Sealer(KEY, own.id, 1) for own in self.drones]
         self._in_flight: list[InFlight] = []
@@ -127,7 +127,11 @@ class TeamOnBoard:
     def _hear(self, now: float) -> None:
         due = sorted(message for message in self._in_flight if message.arrival <= now + 1e-9)
         self._in_flight = [message for message in self._in_flight if message.arrival > now + 1e-9]
-        reach, tick, key = self.env.air.state.reach[self.world], int(self.env.ticks[self.world]), self.env._keys[self.world]
+        reach, tick, key = (
+            self.env.air.state.reach[self.world],
+            int(self.env.ticks[self.world]),
+            self.env._keys[self.world],
+        )
         for message in due:
             for own in self.drones:
                 if not reach[message.sender, own.at[1]]:
@@ -183,6 +187,7 @@ class TeamOnBoard:
             return scan
         if record["kind"] == TILES:
             source = int(record["source"]) + 1
+            self.relayed += source != own.id
             return messages.Tiles(source, [self._tile(source, place, version) for place, version in told])
         if record["kind"] == DIGEST:  # what it tells decides only what is sent, and that is the batch's affair here
             return messages.Digest(now, [])

@@ -157,7 +157,12 @@ def test_a_coverage_of_just_the_share_counts() -> None:
 
 def test_exploration_tells_what_can_be_seen_from_outside() -> None:
     explored = ExplorationSettings(
-        levels=("1",), worlds=2, drones=2, mirror=False, episode_ticks=45, stop_coverage=1.0,
+        levels=("1",),
+        worlds=2,
+        drones=2,
+        mirror=False,
+        episode_ticks=45,
+        stop_coverage=1.0,
         radio=RadioSettings(range_m=1.5),
     )
     env = Exploration(explored, seed=5, restart=False)

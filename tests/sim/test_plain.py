@@ -24,6 +24,7 @@ from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.level import BUILT_IN, Person, load_level
 from imagine.sim.lidar_model import LidarModel
+from imagine.sim.odometry_drift import DriftSettings
 from imagine.sim.plain import PlainExploration
 from imagine.sim.plain.exploration import Variant
 from imagine.sim.plain.handover import hand_over_mesh
@@ -400,6 +401,7 @@ def test_what_the_plain_step_lacks_is_refused() -> None:
         "dynamics": {"dynamics": DynamicsSettings(wind_mps=0.1)},
         "sensing": {"sensing": LidarModel(skew=True)},
         "observation": {"observation": ObservationSpec(peers=2)},
+        "drift": {"drift": DriftSettings(enabled=True)},
     }.items():
         with pytest.raises(InputError, match=f"plain exploration has no {name}"):
             PlainExploration(settings(**changes), 0)

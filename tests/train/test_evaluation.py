@@ -5,10 +5,13 @@ import pytest
 
 from imagine.core.errors import InputError
 from imagine.core.observation_spec import ObservationSpec
+from imagine.mesh_comm.settings import MeshSettings
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.film import Film
 from imagine.sim.metrics import BYTE_KINDS, EpisodeMetrics
-from imagine.train.evaluation import BYTES_PER_TILE, bootstrap_interval, evaluate, named_policy, row, run_episodes
+from imagine.sim.radio import RadioSettings
+from imagine.sim.twin import TICK_S
+from imagine.train.evaluation import bootstrap_interval, evaluate, named_policy, row, run_episodes
 from imagine.train.networks import Actor, NetworkSettings
 from imagine.train.policies import policy_of
 
@@ -26,8 +29,9 @@ def test_a_row_for_each_level_and_team_with_the_documented_keys():
     assert all(list(row) == KEYS for row in rows)
     assert json.loads(json.dumps(rows)) is not None
     assert rows[0]["coverage_mean"] > 0.95
-    assert rows[0]["bytes_per_drone"] == 0.0  # nobody to talk to
-    assert rows[1]["bytes_per_drone"] > 0.0
+    alone, together = rows[0]["bytes_sent"], rows[1]["bytes_sent"]
+    assert [kind for kind in BYTE_KINDS if alone[kind] > 0.0] == ["status"]  # for the ground: no peer to tell more
+    assert all(together[kind] > 0.0 for kind in BYTE_KINDS)
 
 
 def test_equal_seeds_give_equal_rows():
@@ -40,12 +44,12 @@ def test_the_planner_beats_chance():
     assert frontier["coverage_mean"] > random["coverage_mean"] + 0.2
 
 
-def test_a_network_flies_and_protocol_off_sends_nothing():
+def test_a_network_flies_and_protocol_off_shares_no_maps():
     actor = Actor(NetworkSettings(), SHORT.observation, 2)
     (row,) = evaluate(policy_of(actor, "untrained", SHORT), ["0"], drones=(2,), protocol="off", episodes=2)
     assert row["policy"] == "untrained"
     assert row["episodes"] == 2
-    assert row["bytes_per_drone"] == 0.0
+    assert [kind for kind in BYTE_KINDS if row["bytes_sent"][kind] > 0.0] == ["status"]
 
 
 def episode(coverage=0.5, t90=None, **changes):
@@ -54,8 +58,9 @@ def episode(coverage=0.5, t90=None, **changes):
         "world": 0, "seed": 0, "level": "x", "ticks": 500, "coverage": coverage,
         "curve": np.array([coverage], np.float32), "t90": t90, "t95": None, "t99": None, "overlap": 1.5,
         "path_m": np.array([2.0, 4.0]), "discovered": zeros, "drone_curves": np.zeros((2, 1), np.float32),
-        "known": zeros, "contacts": 1, "tiles_sent": zeros + 10, "link_ticks": zeros,
-        "pair_ticks": np.zeros((2, 2), np.int64), "alive_ticks": zeros + 500,
+        "known": zeros, "contacts": 1, "link_ticks": zeros, "pair_ticks": np.zeros((2, 2), np.int64),
+        "alive_ticks": zeros + 500, "contacts_by": np.array([[1, 0, 0], [0, 0, 0]]),
+        "bytes_by": np.zeros((2, 4), np.int64), "cells_by": np.zeros((2, 3), np.int64),
     }  # fmt: skip
     return EpisodeMetrics(**(given | changes))
 
@@ -74,19 +79,25 @@ def test_an_episode_that_never_gets_there_counts_with_its_full_length():
     assert numbers["collisions_per_episode"] == 1.0
 
 
-def test_bytes_are_the_radios_where_it_counts_them_and_else_guessed_from_tiles():
-    assert row_of(episode())["bytes_per_drone"] == 10 * BYTES_PER_TILE
-    assert row_of(episode())["bytes_sent"] == {"scan": 0.0, "tile": 10.0 * BYTES_PER_TILE, "digest": 0.0, "status": 0.0}
+def test_bytes_are_told_for_a_drone_by_kind():
     counted = row_of(episode(bytes_by=np.array([[1, 2, 3, 4], [5, 6, 7, 8]])), episode(bytes_by=np.full((2, 4), 10)))
     assert counted["bytes_sent"] == dict(zip(BYTE_KINDS, [6.5, 7.0, 7.5, 8.0], strict=True))
     assert counted["bytes_per_drone"] == sum(counted["bytes_sent"].values())
 
 
-def test_contacts_by_kind_are_told_where_every_episode_tells_them():
+def test_contacts_are_told_for_the_team_by_kind():
     told = np.array([[1, 2, 0], [3, 0, 0]])
-    assert row_of(episode(), episode(contacts_by=told))["collisions_by_kind"] is None
     both = row_of(episode(contacts_by=told), episode(contacts_by=0 * told))
     assert both["collisions_by_kind"] == {"wall": 2.0, "drone": 1.0, "mover": 0.0}
+
+
+def test_what_is_told_of_bytes_is_what_the_radio_sent():
+    settings = SHORT.model_copy(update={"levels": ("1",), "drones": 2, "mirror": False, "random_launch": False})
+    flown = run_episodes("frontier", settings, 1, 3)
+    told = row("frontier", "1", 2, "one-hop", flown, settings, 0)["bytes_sent"]
+    budget = RadioSettings().rate_bps / 8.0 * TICK_S * flown[0].ticks + MeshSettings().burst_bytes
+    assert all(told[kind] > 0.0 for kind in BYTE_KINDS)
+    assert sum(told.values()) <= budget
 
 
 def test_what_the_team_is_like_is_averaged_over_episodes():

@@ -119,13 +119,13 @@ def test_a_rollout_holds_what_was_seen_done_and_earned():
     env = Exploration(ExplorationSettings(levels=("0",), worlds=2, drones=2, episode_ticks=8, observation=SPEC), seed=1)
     actor, _, _, generator = learners()
     observation = env.reset()
+    seen = observation.policy["views"].reshape(4, *SPEC.shapes["views"]).copy()
     rollout, after = collect(env, observation, actor, 10, generator)
     assert rollout.agent_steps == 40
     assert rollout.dones.any(dim=0).all()
     assert len(rollout.episodes) >= 2
     assert rollout.rewards.min() >= 0.0
     assert rollout.rewards.sum() > 0.0
-    seen = observation.policy["views"].reshape(4, *SPEC.shapes["views"])
     np.testing.assert_array_equal(rollout.observations["views"][0], seen)
     np.testing.assert_array_equal(rollout.last["level"], after.critic.reshape(4, 5, 32, 32))
     mean = actor(*(rollout.observations[key][4] for key in OBSERVATION_KEYS))
