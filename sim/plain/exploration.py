@@ -186,6 +186,8 @@ class PlainExploration:
         self.ranges = ranges
         now = round(self.ticks * TICK_S, 9)
         self.mesh.hear(now, self.world.poses, self.alive)
+        if self.ticks == 0:
+            self.mesh.meet(now, self.world.poses)
         scans: list[Scan | None] = [None] * self.drones
         self.maps.gained[:] = 0
         for drone in np.flatnonzero(self.alive).tolist():
@@ -263,6 +265,7 @@ def _check(settings: ExplorationSettings) -> None:
     lacking = {
         "dynamics": settings.dynamics != DynamicsSettings(),
         "sensing": settings.sensing != LidarModel(),
+        "drift": settings.drift.enabled,
         "observation: position, heading, peers, visits": settings.observation.version != 1,
     }
     for name, is_asked_for in lacking.items():

@@ -37,10 +37,7 @@ def hand_over_maps(batch: Exploration, world: int, maps: PlainMaps) -> None:
                 at = row + maps.corner.row - own.corner.row, column + maps.corner.column - own.corner.column
                 own.layers[source + 1].provisional[at] = True
             own.layers[source + 1].clock = int(versions.max())
-        own.layers[drone + 1].clock = int(arrays.clocks[world, drone])
-    seen: NDArray[np.bool_] = maps.seen
-    height, width = len(seen), len(seen[0])
-    seen[...] = np.asarray(arrays.seen)[world][:height, :width]
+    maps.seen[...] = arrays.seen[world, : rows * TILE, : columns * TILE]
     maps.discovered[...] = arrays.discovered[world]
     maps.derive()
 

@@ -64,6 +64,14 @@ class PlainMesh:
             for datagram in node.poll(now):
                 self.radio.send(node.id, datagram, now)
 
+    def meet(self, now: float, poses: NDArray[np.float64]) -> None:
+        """Let those that reach each other at `poses` `[drones, 3]` know it: before an episode they have told."""
+        reach = self.radio.in_reach(poses)[1:, 1:]
+        for sender, receiver in np.argwhere(reach).tolist():
+            heard = {int(other) + 1: 0.0 for other in np.flatnonzero(reach[sender])}
+            pose = Pose(*poses[sender].tolist())
+            self.tell(sender, receiver, exploring(sender + 1, now, pose, (0.0, 0.0), heard), now)
+
     def tell(self, sender: int, receiver: int, message: Message, at: float) -> None:
         """Let drone `receiver` have heard a message of drone `sender` (both counted from 0) at a time."""
         self.nodes[receiver].receive(self._sealers[sender].seal(encode(message)), at)

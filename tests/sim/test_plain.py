@@ -18,13 +18,16 @@ from imagine.core.lidar import LidarSpec
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.raster import TILE
 from imagine.core.vehicle_limits import VehicleLimits
+from imagine.sim.air_receive import peer_place
 from imagine.sim.dynamics import DynamicsSettings
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.level import BUILT_IN, Person, load_level
 from imagine.sim.lidar_model import LidarModel
+from imagine.sim.odometry_drift import DriftSettings
 from imagine.sim.plain import PlainExploration
 from imagine.sim.plain.exploration import Variant
+from imagine.sim.plain.handover import hand_over_mesh
 from imagine.sim.plain.world import PlainWorld
 from imagine.sim.radio import RadioSettings
 from imagine.sim.reward import RewardSettings
@@ -207,7 +210,10 @@ def test_a_world_is_taken_over_in_the_middle_of_an_episode(protocol: str) -> Non
     plain = PlainExploration(env.settings, 0, variant="plain-kernels")
     plain.take_over(env, 1)
     same_maps(plain, env, 1)
-    for _ in range(10):  # until it is forgotten that nobody knew when what was sent
+    np.testing.assert_array_equal([own.layers[own.own].clock for own in plain.maps.evidence], env.maps.arrays.clocks[1])
+    tick_together(env, plain, 1, planned(env))
+    assert plain.mesh.bytes_sent()[:, 1].sum() > 0  # which takes knowing what the peers lack
+    for _ in range(9):  # until it is forgotten that nobody knew when what was sent
         tick_together(env, plain, 1, planned(env))
     before = plain.mesh.bytes_sent().sum(), env.air.bytes_sent[1].sum()
     apart = []
@@ -220,6 +226,27 @@ def test_a_world_is_taken_over_in_the_middle_of_an_episode(protocol: str) -> Non
     np.testing.assert_array_equal(*own_maps(plain, env, 1))
     sent = plain.mesh.bytes_sent().sum() - before[0], env.air.bytes_sent[1].sum() - before[1]
     assert sent[0] == pytest.approx(sent[1], rel=0.1)
+
+
+def test_nodes_that_take_over_know_where_their_peers_are_and_what_they_may_pass_on() -> None:
+    env = Exploration(settings(levels=("6",), protocol="multi-hop"), seed=2)
+    env.reset()
+    for _ in range(60):
+        env.step(planned(env))
+    plain = PlainExploration(env.settings, 0, variant="plain-kernels")
+    plain.take_over(env, 1)
+    air = env.air.state
+    for drone, node in enumerate(plain.mesh.nodes):
+        told = [peer_place(air.peers[1, drone, peer], 60, air.rules) for peer in range(3) if peer != drone]
+        assert all(known for _, _, known in told)
+        np.testing.assert_allclose(node.teammates(6.0), [(x, y) for x, y, _ in told])
+    plain.begin(env.twin.levels[1], [Pose(*pose) for pose in env.twin.poses[1].tolist()])
+    hand_over_mesh(env, 1, plain.maps, plain.mesh)  # the maps themselves not yet: all that they hold is confirmed
+    rows, columns = plain.maps.seen.shape
+    for drone, source in np.ndindex(3, 3):
+        confirmed = air.confirmed[1, drone, source, :rows, :columns]
+        np.testing.assert_array_equal(plain.maps.layer(drone, source), confirmed)
+        assert confirmed.any() == (drone != source)
 
 
 def test_who_cannot_see_runs_into_things_is_punished_and_falls_in_both() -> None:
@@ -327,8 +354,11 @@ def test_noise_has_the_sensors_width_and_what_it_cannot_measure_is_apart() -> No
 
 def test_running_into_walls_and_each_other_is_the_same_in_both() -> None:
     met = np.zeros(2, np.int64)
-    for name, drones in (("3", 3), ("0", 5)):
-        level, lidar = load_level(name), LidarSpec(beams=8)
+    turns = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    tower = (3.0 + 0.8 * np.column_stack((np.cos(turns), np.sin(turns))),)
+    round_the_tower = dataclasses.replace(load_level("0"), solids=tower, launch=(1.0, 1.0))
+    lidar = LidarSpec(beams=8)
+    for level, drones in ((load_level("3"), 3), (load_level("0"), 5), (round_the_tower, 4)):
         twin = Twin([level], drones, lidar)
         plain = PlainWorld(level, level.launch_poses(drones), lidar, VehicleLimits())
         rng = np.random.default_rng(4)
@@ -371,6 +401,7 @@ def test_what_the_plain_step_lacks_is_refused() -> None:
         "dynamics": {"dynamics": DynamicsSettings(wind_mps=0.1)},
         "sensing": {"sensing": LidarModel(skew=True)},
         "observation": {"observation": ObservationSpec(peers=2)},
+        "drift": {"drift": DriftSettings(enabled=True)},
     }.items():
         with pytest.raises(InputError, match=f"plain exploration has no {name}"):
             PlainExploration(settings(**changes), 0)
