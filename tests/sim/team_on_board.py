@@ -127,7 +127,11 @@ class TeamOnBoard:
     def _hear(self, now: float) -> None:
         due = sorted(message for message in self._in_flight if message.arrival <= now + 1e-9)
         self._in_flight = [message for message in self._in_flight if message.arrival > now + 1e-9]
-        reach, tick, key = self.env.air.state.reach[self.world], int(self.env.ticks[self.world]), self.env._keys[self.world]
+        reach, tick, key = (
+            self.env.air.state.reach[self.world],
+            int(self.env.ticks[self.world]),
+            self.env._keys[self.world],
+        )
         for message in due:
             for own in self.drones:
                 if not reach[message.sender, own.at[1]]:

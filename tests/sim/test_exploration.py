@@ -283,7 +283,9 @@ def test_more_drones_than_a_level_has_room_for_are_refused(tmp_path: Path) -> No
     (tmp_path / "closet.yaml").write_text("{size_m: [2, 2], launch: [1, 1]}")
     closet = str(tmp_path / "closet.yaml")
     assert Exploration(settings(levels=(closet,)), seed=0).drones == 2
-    with pytest.raises(InputError, match=r"closet.*: room for \d+ drones around .*, not 16: .* take fewer, or a larger"):
+    with pytest.raises(
+        InputError, match=r"closet.*: room for \d+ drones around .*, not 16: .* take fewer, or a larger"
+    ):
         Exploration(settings(levels=(closet,), drones=16), seed=0)
 
 
