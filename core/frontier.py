@@ -74,35 +74,36 @@ def refresh_states(belief, states, tile_row, tile_column):  # type: ignore[no-un
     the padded grid, the first row past the last where none did.
     """
     first_row, last_row, first_column, last_column = 1 << 30, -1, 1 << 30, -1
-    fresh = np.empty(PLAN_TILE, np.uint8)
     for i in range(PLAN_TILE):
         upper, lower = belief[tile_row * TILE + 2 * i], belief[tile_row * TILE + 2 * i + 1]
         row = tile_row * PLAN_TILE + i + PAD
         out = states[row]
         differing = np.uint8(0)
-        for j in range(PLAN_TILE):
+        for j in range(PLAN_TILE):  # without branches: whether anything in the row changed
             k = np.uint64(tile_column * TILE + 2 * j)
-            a, b = upper[k], upper[k + np.uint64(1)]
-            c, d = lower[k], lower[k + np.uint64(1)]
-            a, c = (a if a > b else b), (c if c > d else d)
-            highest = a if a > c else c
-            a, b = upper[k], upper[k + np.uint64(1)]
-            c, d = lower[k], lower[k + np.uint64(1)]
-            a, c = (a if a < b else b), (c if c < d else d)
-            lowest = a if a < c else c
-            free = np.uint8(FREE) if lowest < 0 else np.uint8(UNKNOWN)
-            state = np.uint8(OCCUPIED) if highest > 0 else free
-            fresh[j] = state
+            state = _reduced(upper[k], upper[k + np.uint64(1)], lower[k], lower[k + np.uint64(1)])
             differing = np.uint8(differing | (state ^ out[np.uint64(tile_column * PLAN_TILE + j + PAD)]))
         if differing == 0:
             continue
         first_row, last_row = min(first_row, row), row
         for j in range(PLAN_TILE):
-            column = tile_column * PLAN_TILE + j + PAD
-            if out[column] != fresh[j]:
-                out[column] = fresh[j]
+            k, column = tile_column * TILE + 2 * j, tile_column * PLAN_TILE + j + PAD
+            state = _reduced(upper[k], upper[k + 1], lower[k], lower[k + 1])
+            if out[column] != state:
+                out[column] = state
                 first_column, last_column = min(first_column, column), max(last_column, column)
     return first_row, last_row, first_column, last_column
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _reduced(a, b, c, d):  # type: ignore[no-untyped-def]
+    """Return the state of a planning cell whose four cells have this evidence."""
+    above, below = (a if a > b else b), (c if c > d else d)
+    highest = above if above > below else below
+    above, below = (a if a < b else b), (c if c < d else d)
+    lowest = above if above < below else below
+    free = np.uint8(FREE) if lowest < 0 else np.uint8(UNKNOWN)
+    return np.uint8(OCCUPIED) if highest > 0 else free
 
 
 @numba.njit(cache=True, nogil=True)
@@ -191,7 +192,7 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
     heads, entry_cell, entry_next = scratch
     width = cost.shape[1]
     costs, flat_kinds = cost.ravel(), kinds.ravel()
-    entries, lowest = 0, FAR
+    entries, lowest = 0, np.int64(FAR)
     for k in range(count):
         cell = dirty[k]
         old = np.int64(costs[cell])
@@ -201,14 +202,14 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
             entries += 1
             lowest = min(lowest, old)
     count = _drop_unsupported(costs, flat_kinds, np.uint32(width), lowest, entries, dirty, count, is_dirty, scratch)
-    entries, lowest = 0, FAR
+    entries, lowest = 0, np.int64(FAR)
     for k in range(count):
         cell = np.uint32(dirty[k])
         is_dirty[cell] = 0
         kind = flat_kinds[cell]
         if not kind & np.uint8(_OPEN):
             continue
-        found = 0 if kind & np.uint8(_FRONTIER) else _least(costs, flat_kinds, cell, np.uint32(width))
+        found = np.int64(0) if kind & np.uint8(_FRONTIER) else _least(costs, flat_kinds, cell, np.uint32(width))
         if found < costs[cell]:
             costs[cell] = found
             entry_cell[entries], entry_next[entries], heads[found] = cell, heads[found], entries
@@ -389,11 +390,11 @@ def search_scratch(cells: int) -> tuple[NDArray[np.int32], NDArray[np.int32], ND
 @numba.njit(cache=True, nogil=True)
 def has_frontier(kinds):  # type: ignore[no-untyped-def]
     """Tell whether any cell is a frontier."""
-    flat = kinds.ravel()
-    cell = 0
-    while cell < len(flat) and not flat[cell] & np.uint8(_FRONTIER):
-        cell += 1
-    return cell < len(flat)
+    words = kinds.ravel().view(np.uint64)  # a padded grid of whole tiles is a multiple of 16 cells
+    word = 0
+    while word < len(words) and not words[word] & np.uint64(0x0101010101010101 * _FRONTIER):
+        word += 1
+    return word < len(words)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -410,7 +411,7 @@ def fill_distance(cost, distance):  # type: ignore[no-untyped-def]
 def cost_at(cost, column, row):  # type: ignore[no-untyped-def]
     """Return the cost at a planning cell of the unpadded grid, or the least within two cells where it has none; FAR."""
     rows, columns = cost.shape[0] - 2 * PAD, cost.shape[1] - 2 * PAD
-    best = FAR
+    best = np.int64(FAR)
     for ring in range(3):
         for i in range(max(0, row - ring), min(rows, row + ring + 1)):
             for j in range(max(0, column - ring), min(columns, column + ring + 1)):

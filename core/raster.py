@@ -206,7 +206,7 @@ def apply_marks(cells, marks, row0, column0, touched):  # type: ignore[no-untype
 @numba.njit(cache=True, nogil=True)
 def _add(cells, first, last, column, marks, mark_row, mark_column):  # type: ignore[no-untyped-def]
     """Add a tile's width of marks to rows first to last of the cells; return how many changed."""
-    changed = 0
+    changed = np.int64(0)
     for i in range(last - first):
         line, mark_line = cells[first + i], marks[mark_row + i]
         differing = np.int8(0)

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from imagine.core.errors import InputError
+from imagine.kernel_cache import announce_compiling
 from imagine.outputs import check_outputs, write_json
 from imagine.sim.bench import BenchPlan, Results, bench_twin
 from imagine.sim.level import load_level
@@ -33,6 +34,7 @@ def bench_twin_and_show(
         if plot_file.suffix.lower() != ".png":
             raise InputError(f"--plot {plot_file}: the plot is drawn as PNG: name a file that ends in .png")
         check_outputs(plot_file)
+    announce_compiling(lambda text: print(text, file=sys.stderr))
     results = bench_twin(plan, progress=lambda text: print(text, file=sys.stderr))
     results["cores"] = {"value": len(os.sched_getaffinity(0)), "unit": "cores"}
     console = Console()
@@ -124,9 +126,14 @@ def growth_table(plan: BenchPlan, what: str, results: Results) -> Table:
             f"{row['per_cpu_s']:,.0f}", f"{row['array_bytes_a_drone'] / 1e3:,.0f}",
             *([f"{row['resident_bytes_a_drone'] / 1e3:,.0f}"] if what == "worlds" else []),
         )  # fmt: skip
-    for name in ("time", "memory"):
+    for name in ("time",) if what == "worlds" else ("time", "memory"):  # over worlds, a line says more of memory
         if (power := results.get(f"{name}_growth_{what}")) is not None:
             notes.append(f"{'CPU time' if name == 'time' else name} grows as {what}^{power['value']:.2f}")
+    if what == "worlds":
+        for name, of in (("memory_a_drone", "arrays"), ("resident_a_drone", "resident memory")):
+            if (line := results.get(name)) is not None:
+                each, whole = line["value"] / 1e6, line["fixed"] / 1e6
+                notes.append(f"{of}: {each:.2f} MB a drone and {whole:.0f} MB for all, within {line['off']:.0%}")
     table.caption = "\n".join(notes)
     return table
 
@@ -138,12 +145,16 @@ def stage_table(plan: BenchPlan, results: Results) -> Table | None:
     found = {column: stages for column, stages in found.items() if stages}
     if not found:
         return None
-    table = _table("Where the time goes, µs an agent-step")
+    table = _table("Where the CPU time goes, µs an agent-step")
     table.add_column("stage")
     for who, beams in found:
         table.add_column("\n".join([*who.split("_"), f"{beams} beams"]), justify="right", vertical="bottom")
     for name in dict.fromkeys(name for stages in found.values() for name in stages):
         table.add_row(name, *(f"{stages[name]:,.1f}" if name in stages else "" for stages in found.values()))
+    table.add_row("all", *(f"{sum(stages.values()):,.1f}" for stages in found.values()))
+    critics = [results.get(f"{who}_critic_{beams}_beams") for who, beams in found]
+    table.add_row("critic", *(f"{critic['value']:,.1f}" if critic else "" for critic in critics))
+    table.caption = "rest: Python outside the stages. critic: on demand, not in the rates."
     return table
 
 

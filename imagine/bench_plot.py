@@ -15,7 +15,7 @@ _BATCHED, _PLAIN, _GUIDE = "#1b6ca8", "#c8553d", "#9a9a9a"
 
 
 def plot_growth(path: Path, plan: BenchPlan, results: Results) -> None:
-    """Write a PNG of CPU time over worlds, time over drones and memory over worlds, log-log.
+    """Write a PNG of CPU time over worlds, time over drones, and memory over worlds, log-log.
 
     Raises InputError where matplotlib is missing or the file cannot be written.
     """
@@ -56,6 +56,8 @@ def plot_growth(path: Path, plan: BenchPlan, results: Results) -> None:
     sizes = [row["worlds"] for row in by_worlds]
     whole = [row["array_bytes_a_drone"] * row["worlds"] * row["drones"] / 1e6 for row in by_worlds]
     _curve(memory, plan.worlds, sizes, whole, _BATCHED, "arrays")
+    resident = [row["resident_bytes_a_drone"] * row["worlds"] * row["drones"] / 1e6 for row in by_worlds]
+    memory.plot(sizes, resident, "--", color=_BATCHED, lw=1.2, label="resident")
     _finish(memory, f"worlds of {plan.compared_drones} drones", "memory of the batch, MB")
     try:
         figure.savefig(path)
@@ -88,5 +90,6 @@ def _finish(axes: Axes, x_label: str, y_label: str) -> None:
     axes.set_title(y_label, loc="left", fontsize=10)
     axes.grid(True, which="major", color="#e6e6e6", lw=0.8)
     axes.set_axisbelow(True)
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value >= 1.0 else f"{value:g}")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8.5, loc="upper left")

@@ -226,9 +226,11 @@ def train(
     _needs("torch", "train")
     from rich.console import Console
 
+    from imagine.kernel_cache import announce_compiling
     from imagine.train.report import LiveReporter, LogReporter
     from imagine.train.trainer import train as run_training
 
+    announce_compiling(lambda text: print(text, file=sys.stderr))
     console = Console()
     with contextlib.ExitStack() as stack:
         report = stack.enter_context(LiveReporter(console)) if console.is_terminal else LogReporter()

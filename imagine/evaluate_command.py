@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from imagine.core.errors import InputError
+from imagine.kernel_cache import announce_compiling
 from imagine.mesh_comm.settings import Protocol
 from imagine.onboard.settings import DEFAULT_POLICY
 from imagine.outputs import write_json
@@ -43,9 +44,10 @@ def evaluate_and_show(
     chosen_levels, sizes = level_list(levels), team_sizes(drones)
     chosen = named_policy(policy or str(DEFAULT_POLICY))
     film = None if film_file is None else Film()
+    announce_compiling(_say)
     rows = evaluate(
         chosen, chosen_levels, sizes, protocol, episodes, seed,
-        progress=lambda text: print(text, file=sys.stderr), film=film,
+        progress=_say, film=film,
     )  # fmt: skip
     title = f"{policy or 'shipped policy'}, {protocol}, {episodes} episodes each"
     table = Table(title=title, box=None, padding=(0, 1, 0, 0))  # so that it fits into 80 columns
@@ -59,6 +61,10 @@ def evaluate_and_show(
         encoded = film.encode(film_file.suffix)
         write_atomically(film_file, lambda temporary: temporary.write_bytes(encoded))
         print(f"{film_file}: {len(film)} pictures, {len(encoded) / 1e6:.2f} MB", file=sys.stderr)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
 
 
 def _cell(value: object) -> str:

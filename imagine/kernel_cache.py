@@ -7,10 +7,13 @@ they may take constants from, prevents that.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
+import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 _KEPT = 8  # folders of other versions and checkouts that stay for a while
@@ -32,6 +35,16 @@ def use_kernel_cache() -> None:
     except OSError:
         folder = Path(tempfile.mkdtemp(prefix="imagine-kernels-"))
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
+
+
+def announce_compiling(say: Callable[[str], None]) -> None:
+    """Tell whoever waits at a terminal, the first time that this version's batched twin runs, why nothing moves yet."""
+    marker = Path(os.environ["NUMBA_CACHE_DIR"]) / "exploration-kernels"
+    if marker.exists() or not sys.stderr.isatty():
+        return
+    say("first start: compiling the twin's kernels, which takes about a minute once")
+    with contextlib.suppress(OSError):  # without a cache everybody compiles for himself, and is told so
+        marker.touch()
 
 
 def kernel_digest(package: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -60,11 +61,17 @@ def collect(said: Iterable[Said]) -> dict[str, Samples]:
 
 
 def fly(seed: int = 1, ticks: int = 400) -> list[Said]:
-    """Return what teams of three say on levels 1, 3, 4, 5 and 6, half of them relaying."""
+    """Return what teams of three say on levels 1, 3, 4, 5 and 6, half of them relaying; with all beams, and with 64.
+
+    Few beams leave gaps between them, which scans and tiles of many do not have.
+    """
     said = []
-    for number, level in enumerate(("1", "3", "4", "5", "6")):
-        mesh = MeshSettings(protocol="multi-hop" if number % 2 else "one-hop")
-        said += MeshFlight(load_level(level), 3, RadioSettings(), mesh, seed=seed + number).fly(ticks).said
+    for beams in (LD19.beams, 64):
+        lidar = dataclasses.replace(LD19, beams=beams)
+        for number, level in enumerate(("1", "3", "4", "5", "6")):
+            mesh = MeshSettings(protocol="multi-hop" if number % 2 else "one-hop")
+            flight = MeshFlight(load_level(level), 3, RadioSettings(), mesh, seed=seed + number, lidar=lidar)
+            said += flight.fly(ticks).said
     return said
 
 

@@ -25,8 +25,9 @@ class DecisionState:
     """The state behind the options of an observation and behind actions, for drones `[worlds, drones]`.
 
     `positions` float64 `[worlds, drones, peers, 2]` and `ages` `[worlds, drones, peers]` are what each drone was told
-    by the others (`PeerPoses`), `explorer_ages` the same for those who said that they explore; `own_visits` and `peer_visits` uint16 `[worlds, drones, rows // 2, columns // 2]`, empty
-    where the specification shows none; `intents` float64 `[worlds, drones, 3]` the decisions that stand.
+    by the others (`PeerPoses`), `explorer_ages` the same for those who said that they explore; `own_visits` and
+    `peer_visits` uint16 `[worlds, drones, rows // 2, columns // 2]`, empty where the specification shows none;
+    `intents` float64 `[worlds, drones, 3]` the decisions that stand.
     """
 
     def __init__(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
 from imagine.core.lidar import TEAMMATE_RADIUS_M
+from imagine.core.raster import TILE
 from imagine.sim.air import Air
 from imagine.sim.air_receive import claim_own
 from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
@@ -102,7 +103,7 @@ class Exploration:
         cap = settings.map.range_cap_m
         self.maps = TeamMaps(worlds, drones, rows, columns, self.lidar, cap, workers)
         self.air = Air(
-            worlds, drones, *self.maps.versions.shape[3:], settings.radio, settings.mesh, self.lidar, cap, TICK_S
+            worlds, drones, rows // TILE, columns // TILE, settings.radio, settings.mesh, self.lidar, cap, TICK_S
         )
         self.decisions = DecisionState(worlds, drones, rows, columns, settings.observation, settings.action, workers)
         self._recorder = Recorder(worlds, drones, seed)
@@ -219,7 +220,7 @@ class Exploration:
         return earned
 
     def _run(self, modes: NDArray[np.int64], shown: NDArray[np.int64]) -> None:
-        """Run a tick in all worlds, as `modes` says for each, and observe those whose mode in `shown` is not WAITING."""
+        """Run a tick in all worlds, as `modes` says for each; observe those whose mode in `shown` is not WAITING."""
         observes = bool((shown != WAITING).any())
         twin = self.twin
         sensors, flight = twin.sensors(self._sight_m), twin.kernel_args()

@@ -250,22 +250,22 @@ def _sum_tile(layers, belief, tile_row, tile_column):  # type: ignore[no-untyped
     sources, rows, columns = layers.shape
     side = columns // (columns // TILE)  # TILE, but unknown to the compiler, which would unroll and not vectorise
     flat, out = layers.ravel(), belief.ravel()
-    total = np.empty(TILE, np.int16)
+    total = np.empty(0 if sources == 3 else TILE, np.int16)
     for i in range(tile_row * side, (tile_row + 1) * side):
         at = i * columns + tile_column * side
         second, third = at + rows * columns, at + 2 * rows * columns
-        if sources == 3:
+        if sources == 3:  # the usual team, in one go
             for j in range(side):
-                total[np.uint64(j)] = np.int16(
-                    flat[np.uint64(at + j)] + flat[np.uint64(second + j)] + flat[np.uint64(third + j)]
-                )
-        else:
+                value = np.int16(flat[np.uint64(at + j)] + flat[np.uint64(second + j)] + flat[np.uint64(third + j)])
+                value = value if value < np.int16(LIMIT) else np.int16(LIMIT)
+                out[np.uint64(at + j)] = np.int8(value if value > np.int16(-LIMIT) else np.int16(-LIMIT))
+            continue
+        for j in range(side):
+            total[np.uint64(j)] = np.int16(flat[np.uint64(at + j)])
+        for source in range(1, sources):
+            other = at + source * rows * columns
             for j in range(side):
-                total[np.uint64(j)] = np.int16(flat[np.uint64(at + j)])
-            for source in range(1, sources):
-                other = at + source * rows * columns
-                for j in range(side):
-                    total[np.uint64(j)] = np.int16(total[np.uint64(j)] + flat[np.uint64(other + j)])
+                total[np.uint64(j)] = np.int16(total[np.uint64(j)] + flat[np.uint64(other + j)])
         for j in range(side):
             value = total[np.uint64(j)]
             value = value if value < np.int16(LIMIT) else np.int16(LIMIT)

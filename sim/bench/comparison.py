@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import statistics
+import time
+
 import numpy as np
 
 from imagine.sim.bench.laps import Laps, StageWatch, ratio
 from imagine.sim.bench.plain_flight import PLAIN, PlainFlight
 from imagine.sim.bench.plan import BenchPlan, Flying, Progress, Results, choose_actions, make_batch
+from imagine.sim.exploration import Exploration
 
 
 def comparison(plan: BenchPlan, beams: int, flying: Flying, progress: Progress = lambda _: None) -> Results:
@@ -22,7 +26,8 @@ def comparison(plan: BenchPlan, beams: int, flying: Flying, progress: Progress =
     for _ in range(plan.episode_ticks if flying == "frontier" else min(plan.random_ticks, plan.episode_ticks)):
         batch.step(choose_actions(batch, flying, generator))
     plain = {variant: PlainFlight(batch, variant, flying) for variant in PLAIN}
-    laps, stages = Laps(), StageWatch(batch)
+    batch.time_stages()
+    laps, stages, critics = Laps(), StageWatch(batch), []
     budget_s = plan.seconds / plan.rounds
     for number in range(plan.rounds):
         progress(f"{title}: round {number + 1} of {plan.rounds}")
@@ -34,6 +39,7 @@ def comparison(plan: BenchPlan, beams: int, flying: Flying, progress: Progress =
             actions = choose_actions(batch, flying, generator)
             with stages, laps.timed(worlds * drones):
                 batch.step(actions)
+        critics.append((_critic_s(batch), plain["plain"].critic_s()))
 
     name = f"{beams}_beams" + ("_random" if flying == "random" else "")
     results = {f"batched_{name}": laps.told()}
@@ -43,4 +49,15 @@ def comparison(plan: BenchPlan, beams: int, flying: Flying, progress: Progress =
         results[f"batched_over_{who}_{name}"] = ratio(laps, flight.laps)
         if flying == "frontier":
             results |= flight.stages.told(who, name, sum(flight.laps.steps))
-    return results | (stages.told("batched", name, sum(laps.steps)) if flying == "frontier" else {})
+    if flying == "frontier":
+        results |= stages.told("batched", name, sum(laps.steps), sum(laps.cpu_s))
+        for who, seconds in zip(("batched", "plain"), zip(*critics, strict=True), strict=True):
+            results[f"{who}_critic_{name}"] = {"value": 1e6 * statistics.median(seconds), "unit": "us/agent-step"}
+    return results
+
+
+def _critic_s(batch: Exploration) -> float:
+    """Return the CPU seconds that the critic's images take for every drone, once: only who asks for them pays."""
+    before = time.process_time()
+    batch.critic_images()
+    return (time.process_time() - before) / (batch.worlds * batch.drones)

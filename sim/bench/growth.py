@@ -129,9 +129,19 @@ def _exponents(what: str, measured: list[dict[str, Any]]) -> Results:
         for name, values in powers.items()
     }
     if what == "worlds":
-        largest = measured[-1]
-        told["memory_a_drone"] = {
-            "value": largest["array_bytes_a_drone"], "unit": "bytes", "resident": largest["resident_bytes_a_drone"],
-            "worlds": largest["worlds"], "drones": largest["drones"],
-        }  # fmt: skip
+        worlds = [row["worlds"] for row in measured]
+        resident = [row["resident_bytes_a_drone"] * row["worlds"] * row["drones"] for row in measured]
+        drones = measured[-1]["drones"]
+        told["memory_a_drone"] = _line(worlds, memory, drones) | {"drones": drones}
+        told["resident_a_drone"] = _line(worlds, resident, drones) | {"drones": drones}
     return told
+
+
+def _line(worlds: list[int], measured: list[float], drones: int) -> dict[str, Any]:
+    """Return the bytes of a further world, a drone, by a straight line through the bytes of all sizes.
+
+    `fixed` is what even no world would take, `off` how far the worst size lies from the line, as a share of its bytes.
+    """
+    slope, fixed = np.polyfit(worlds, measured, 1, w=1.0 / np.maximum(measured, 1.0))
+    off = np.abs((fixed + slope * np.array(worlds)) / np.maximum(measured, 1.0) - 1.0).max()
+    return {"value": float(slope) / drones, "unit": "bytes", "fixed": float(fixed), "off": float(off)}

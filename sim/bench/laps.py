@@ -79,12 +79,18 @@ class StageWatch:
             grown = seconds - self._before.get(stage, 0.0)
             self._seconds[stage] = self._seconds.get(stage, 0.0) + grown
 
-    def told(self, who: str, name: str, steps: int) -> Results:
-        """Return each stage's time an agent-step, and its share of the whole."""
-        total = sum(self._seconds.values()) or 1.0
+    def told(self, who: str, name: str, steps: int, cpu_s: float | None = None) -> Results:
+        """Return each stage's time an agent-step, and its share of the whole.
+
+        With `cpu_s`, the whole, what is left of it beside the stages is told as the stage `rest`.
+        """
+        told = dict(self._seconds)
+        if told and cpu_s is not None:
+            told["rest"] = max(0.0, cpu_s - sum(told.values()))
+        total = sum(told.values()) or 1.0
         return {
             f"{who}_stage_{stage}_{name}": {
                 "value": 1e6 * seconds / max(1, steps), "unit": "us/agent-step", "share": seconds / total,
             }
-            for stage, seconds in self._seconds.items()
+            for stage, seconds in told.items()
         }  # fmt: skip

@@ -26,8 +26,10 @@ def bench_twin(plan: BenchPlan, progress: Progress = lambda _: None) -> Results:
 def _warm_up(plan: BenchPlan) -> None:
     """Compile all kernels, so that no measurement does, and find out whether the level can be flown in at all."""
     batch = make_batch(plan, 1, plan.compared_drones, plan.beams[0])
+    batch.time_stages()
+    batch.step(choose_actions(batch, "frontier", np.random.default_rng(0)))
+    batch.critic_images()
     for variant in PLAIN:
         plain = PlainExploration(batch.settings, 0, variant=variant)
         plain.take_over(batch, 0)
         plain.step(plain.planner_actions())
-    batch.step(choose_actions(batch, "frontier", np.random.default_rng(0)))

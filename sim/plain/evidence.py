@@ -1,4 +1,4 @@
-"""Scans into an int8 log-odds layer with numpy: the definition is that of `core.raster.integrate_scan`."""
+"""Scans into an int8 log-odds layer with numpy: the definition is that of `core.raster`."""
 
 from __future__ import annotations
 
@@ -8,24 +8,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec
-from imagine.core.raster import CELL, HIT, LIMIT, MISS, TILE
+from imagine.core.raster import CELL, HIT, LIMIT, MISS, RANGE_STEP_M, TILE
 
 Cells = NDArray[np.int64]
 
 
 def without_teammates(
-    ranges: NDArray[np.float32], bearings: NDArray[np.float64], offsets: NDArray[np.float64], range_cap_m: float
-) -> NDArray[np.float64]:
-    """Return the ranges `[beams]` as float64, with returns on teammates made invalid (nan).
-
-    `bearings` are the beams' directions in the map frame, `offsets` `[n, 2]` the teammates' positions less the drone's.
-    """
-    kept = ranges.astype(np.float64)
-    for dx, dy in offsets:
+    ranges: NDArray[np.float32],
+    lidar: LidarSpec,
+    pose: tuple[float, float, float],
+    places: NDArray[np.float64],
+    range_cap_m: float,
+) -> NDArray[np.float32]:
+    """Return the ranges `[beams]` with returns on teammates at `places` `[n, 2]` (map frame) made invalid (nan)."""
+    x, y, yaw = pose
+    c, s = math.cos(yaw), math.sin(yaw)
+    kept = ranges.copy()
+    for dx, dy in places - (x, y):
         if dx * dx + dy * dy > (range_cap_m + TEAMMATE_RADIUS_M) ** 2:
-            continue
+            continue  # behind all that is mapped
+        ahead, left = c * dx + s * dy, -s * dx + c * dy
         with np.errstate(invalid="ignore"):  # no return is infinitely far away
-            ex, ey = kept * np.cos(bearings) - dx, kept * np.sin(bearings) - dy
+            ex, ey = kept * np.cos(lidar.bearings) - ahead, kept * np.sin(lidar.bearings) - left
             kept[ex * ex + ey * ey < TEAMMATE_RADIUS_M**2] = np.nan
     return kept
 
@@ -60,26 +64,33 @@ def integrate_scan(
     cells: NDArray[np.int8],
     origin: tuple[int, int],
     pose: tuple[float, float, float],
-    ranges: NDArray[np.float64],
+    ranges: NDArray[np.float32],
     lidar: LidarSpec,
     range_cap_m: float,
-) -> NDArray[np.bool_]:
+) -> tuple[int, NDArray[np.bool_]]:
     """Add one scan's evidence to `cells` (int8 `[rows, columns]`, first cell at `origin` (column, row)), in place.
 
-    Each cell takes one update at most, a hit before a miss. Returns which tiles changed, bool
+    Each cell takes one update at most, a hit before a miss. Returns how many cells changed, and which tiles, bool
     `[rows // TILE, columns // TILE]`.
     """
     x, y, yaw = pose
     rows, columns = cells.shape
-    usable = ranges >= lidar.range_min  # neither nan nor too close to be trusted
-    lengths = np.minimum(ranges[usable], range_cap_m)
-    bearings = yaw + lidar.bearings[usable]
-    end_columns = np.floor((x + lengths * np.cos(bearings)) / CELL).astype(np.int64) - origin[0]
-    end_rows = np.floor((y + lengths * np.sin(bearings)) / CELL).astype(np.int64) - origin[1]
+    measured = ranges.astype(np.float64)
+    usable = measured >= lidar.range_min  # neither nan nor too close to be trusted
+    measured = measured[usable]
+    hit = measured <= range_cap_m
+    steps = np.rint(np.where(hit, measured, range_cap_m) / RANGE_STEP_M)
+    steps = np.clip(steps, 1.0, math.floor(range_cap_m / RANGE_STEP_M + 1e-9))  # a hit is never rounded past the cap
+    rounded = (steps * RANGE_STEP_M).astype(np.float32).astype(np.float64)  # as a peer reads them
+    lengths = np.where(hit, rounded, range_cap_m)
+    c, s = math.cos(yaw), math.sin(yaw)
+    cos_beam, sin_beam = np.cos(lidar.bearings[usable]), np.sin(lidar.bearings[usable])
+    end_x, end_y = x + lengths * (c * cos_beam - s * sin_beam), y + lengths * (s * cos_beam + c * sin_beam)
+    end_columns = np.floor(end_x / CELL).astype(np.int64) - origin[0]
+    end_rows = np.floor(end_y / CELL).astype(np.int64) - origin[1]
     own_column, own_row = math.floor(x / CELL) - origin[0], math.floor(y / CELL) - origin[1]
     free_rows, free_columns = line_cells(own_row, own_column, end_rows, end_columns)
 
-    hit = ranges[usable] <= range_cap_m
     evidence = np.zeros(cells.shape, np.int8)
     for at_rows, at_columns, value in (
         (free_rows, free_columns, MISS),
@@ -88,9 +99,8 @@ def integrate_scan(
         inside = (at_rows >= 0) & (at_rows < rows) & (at_columns >= 0) & (at_columns < columns)
         evidence[at_rows[inside], at_columns[inside]] = value
     updated = np.clip(cells + evidence, -LIMIT, LIMIT)
-    changed = updated != cells
+    changed_rows, changed_columns = np.nonzero(updated != cells)
     cells[...] = updated
     touched = np.zeros((rows // TILE, columns // TILE), np.bool_)
-    changed_rows, changed_columns = np.nonzero(changed)
     touched[changed_rows // TILE, changed_columns // TILE] = True
-    return touched
+    return len(changed_rows), touched

@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from imagine.core.frontier import FREE, OCCUPIED, UNKNOWN
+from imagine.core.frontier import BLOCKED, FAR, FREE, OCCUPIED, PAD, UNKNOWN, FrontierField
 
-_EDGES = ((1, 0, 10), (-1, 0, 10), (0, 1, 10), (0, -1, 10), (1, 1, 14), (-1, -1, 14), (1, -1, 14), (-1, 1, 14))
-"""Steps (row, column, length); 10 is a planning cell's 0.2 m, 14 its diagonal, rounded. Opposites stand in pairs."""
-_UNITS_PER_M = 50.0
+_EDGES = ((1, 0, 5), (-1, 0, 5), (0, 1, 5), (0, -1, 5), (1, 1, 7), (-1, -1, 7), (1, -1, 7), (-1, 1, 7))
+"""Steps (row, column, length in UNIT_M): a planning cell's 0.2 m, and its diagonal. Opposites stand in pairs."""
 _NEAR_WALL_COST = 3
-_PAD = 2  # cells of unknown all around, so that every cell has neighbours of neighbours
 
 Mask = NDArray[np.bool_]
 Ways = Callable[[Mask, NDArray[np.int64], Mask], NDArray[np.float64]]
@@ -31,15 +29,15 @@ def plan_states(belief: NDArray[np.int8]) -> NDArray[np.uint8]:
     return np.where(occupied, OCCUPIED, np.where(free, FREE, UNKNOWN)).astype(np.uint8)
 
 
-def frontier_distances(states: NDArray[np.uint8], ways: Ways | None = None) -> NDArray[np.float32]:
-    """Return the way to the nearest frontier through known free space, float32 metres `[r, c]`, inf where none is.
+def frontier_field(belief: NDArray[np.int8], ways: Ways) -> FrontierField:
+    """Return the frontier field of a belief (int8 `[2 r, 2 c]`), beyond which all is unknown.
 
-    `ways` is how the cheapest ways are found: `heap_ways` (the default) or `scipy_ways`.
+    `ways` is how the cheapest ways are found: `heap_ways` or `scipy_ways`.
     """
-    padded = np.pad(states, _PAD, constant_values=UNKNOWN)
-    free, weight, frontier = _masks(padded)
-    costs = (ways or heap_ways)(free, weight, frontier)
-    return costs[_PAD:-_PAD, _PAD:-_PAD].astype(np.float32) * np.float32(1.0 / _UNITS_PER_M)
+    states = np.pad(plan_states(belief), PAD, constant_values=UNKNOWN)  # so that all have neighbours of neighbours
+    free, weight, frontier = _masks(states)
+    costs = np.minimum(ways(free, weight, frontier), FAR)
+    return FrontierField(np.where(free, costs, BLOCKED).astype(np.int16), states)
 
 
 def _shifted(mask: Mask, rows: int, columns: int) -> Mask:
@@ -77,7 +75,7 @@ def _edges(free: Mask, weight: NDArray[np.int64]) -> Iterator[tuple[int, NDArray
 
 
 def heap_ways(free: Mask, weight: NDArray[np.int64], frontier: Mask) -> NDArray[np.float64]:
-    """Return the cost of the cheapest way from each cell to a frontier, in fiftieths of a metre, inf where none is.
+    """Return the cost of the cheapest way from each cell to a frontier, in UNIT_M, inf where none is.
 
     On flat lists, which Python reads faster than arrays.
     """
@@ -115,13 +113,12 @@ def scipy_ways(free: Mask, weight: NDArray[np.int64], frontier: Mask) -> NDArray
     return cost.reshape(free.shape)
 
 
-def distance_at(distance: NDArray[np.float32], column: int, row: int) -> float:
-    """Return the distance at a planning cell, or the least one within two cells where it has none."""
+def cost_at(cost: NDArray[np.int16], column: int, row: int) -> int:
+    """Return the cost (padded, as `FrontierField.cost`) at a planning cell, or the least within two cells; or FAR."""
+    inner = cost[PAD:-PAD, PAD:-PAD]
     for ring in range(3):
-        window = distance[
-            max(0, row - ring) : max(0, row + ring + 1), max(0, column - ring) : max(0, column + ring + 1)
-        ]
-        best = float(window.min(initial=np.inf))
-        if best < np.inf:
+        window = inner[max(0, row - ring) : max(0, row + ring + 1), max(0, column - ring) : max(0, column + ring + 1)]
+        best = int(window[window >= 0].min(initial=FAR))
+        if best < FAR:
             return best
-    return float(np.inf)
+    return FAR

@@ -1,167 +1,114 @@
-"""What every drone of one world knows, in numpy: layers per source, exchange, belief, coverage, frontier field."""
+"""What every drone of one world knows: an evidence map each, belief, frontier field, and the team's coverage."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.lidar import LidarSpec
-from imagine.core.observation_spec import ObservationSpec
-from imagine.core.raster import CELL, LIMIT, TILE
+from imagine.core.evidence import EvidenceMap, TileKey
+from imagine.core.frames import Pose
+from imagine.core.frontier import FrontierField
+from imagine.core.lidar import LidarSpec, Scan
+from imagine.core.raster import CELL, TILE
 from imagine.sim.level import Level
-from imagine.sim.plain.evidence import integrate_scan, without_teammates
-from imagine.sim.plain.field import Ways, frontier_distances, plan_states
-from imagine.sim.plain.views import motion, sectors, views
+from imagine.sim.plain.evidence import without_teammates
+from imagine.sim.plain.means import Means
 
-Pose3 = tuple[float, float, float]
-
-
-class WorldMaps(Protocol):
-    """The maps of one world's team, in stages of a tick; arrays are `[drone, ...]`, grids those of the level."""
-
-    coverable: NDArray[np.bool_]
-    coverable_cells: int
-    seen: NDArray[np.bool_]
-    discovered: NDArray[np.int64]
-    tiles_sent: NDArray[np.int64]
-
-    @property
-    def distance(self) -> Sequence[NDArray[np.float32]]:
-        """Everyone's frontier distances."""
-
-    @property
-    def states(self) -> Sequence[NDArray[np.uint8]]:
-        """Everyone's planning cells."""
-
-    @property
-    def origins(self) -> Sequence[tuple[int, int]]:
-        """Column and row of the first cell of everyone's map."""
-
-    def integrate(self, ranges: NDArray[np.float32], poses: NDArray[np.float64], connected: NDArray[np.bool_]) -> None:
-        """Add every drone's scan to its own layer, and what that newly covers to its account."""
-
-    def exchange(self, connected: NDArray[np.bool_], relays: bool, tiles_a_tick: int) -> None:
-        """Copy newer tiles along the links, each sender within its budget."""
-
-    def derive(self) -> None:
-        """Bring beliefs up to date."""
-
-    def plan(self) -> None:
-        """Bring frontier fields up to date."""
-
-    def observe(
-        self, drone: int, spec: ObservationSpec, pose: Pose3, velocity: NDArray[np.float64], ranges: NDArray[np.float32]
-    ) -> dict[str, NDArray[np.float32]]:
-        """Return what one drone's policy sees."""
-
-    def take_over(self, layers: NDArray[np.int8], versions: NDArray[np.uint32], clocks: NDArray[np.uint32]) -> None:
-        """Hold these layers `[drones, sources, rows, columns]`, tile versions and clocks from now on."""
+_MOST_EXTENT_M = 512.0
 
 
-class CoverageAccount:
-    """Which coverable cells a team has seen, who saw them first, and who sent what.
+class PlainEvidence(EvidenceMap):
+    """An evidence map that draws scans by given means; its mesh node draws those of peers by them, too."""
 
-    `discovered` counts cells, `tiles_sent` tiles, `[drones]`.
+    def __init__(self, own: int, sources: int, level: Level, means: Means) -> None:
+        """Make an empty map that holds a level, with a layer for each of the sources 1 to `sources`."""
+        super().__init__(own, half_extent_m=CELL * TILE, max_extent_m=_MOST_EXTENT_M)
+        self.means = means
+        column0, row0, columns, rows = level.grid
+        low_x, low_y, high_x, high_y = (
+            (k + 0.5) * CELL for k in (column0, row0, column0 + columns - 1, row0 + rows - 1)
+        )
+        self.cover(low_x, low_y, high_x, high_y)
+        for source in range(1, sources + 1):
+            self.layer(source)
+
+    def _draw(
+        self, source: int, pose: Pose, scan: Scan, spec: LidarSpec, range_cap_m: float
+    ) -> tuple[int, NDArray[np.bool_]]:
+        self.cover(pose.x - range_cap_m, pose.y - range_cap_m, pose.x + range_cap_m, pose.y + range_cap_m)
+        return self.means.draw(self.layer(source).cells, self.origin_cells, pose, scan.ranges, spec, range_cap_m)
+
+
+class PlainMaps:
+    """The maps of one world's team; `evidence[i]` is drone i's, which has number i + 1 in them, as on the mesh.
+
+    `seen` and `coverable` bool `[rows, columns]` on the level's grid; `discovered` and `gained` count the coverable
+    cells each drone was the first to see, in the episode and in this tick, int64 `[drones]`; `beliefs` and `fields`
+    are each drone's, on the level's grid.
     """
 
-    def __init__(self, level: Level, drones: int, range_cap_m: float) -> None:
-        """Start with nothing seen of a level."""
+    def __init__(self, level: Level, drones: int, lidar: LidarSpec, range_cap_m: float, means: Means) -> None:
+        """Make empty maps."""
+        column0, row0, columns, rows = level.grid
+        self.lidar, self.range_cap_m, self._means = lidar, range_cap_m, means
+        self.origin = column0, row0
+        self.corner = TileKey(column0 // TILE, row0 // TILE)
+        self.tiles = rows // TILE, columns // TILE
+        self.evidence = [PlainEvidence(drone + 1, drones, level, means) for drone in range(drones)]
         self.coverable = level.coverable
         self.coverable_cells = max(1, int(self.coverable.sum()))
         self.seen = np.zeros(self.coverable.shape, np.bool_)
-        self.discovered = np.zeros(drones, np.int64)
-        self.tiles_sent = np.zeros(drones, np.int64)
-        self._origin = level.grid[:2]
+        self.discovered, self.gained = np.zeros(drones, np.int64), np.zeros(drones, np.int64)
+        self.beliefs: list[NDArray[np.int8]] = []
+        self.fields: list[FrontierField] = []
         self._reach = math.ceil(range_cap_m / CELL) + 1
+        self.derive()
 
-    def count(self, drone: int, cells: NDArray[np.int8], x: float, y: float) -> None:
-        """Mark as seen what a drone at (x, y) knows around itself; `cells` is its layer on the level's grid."""
-        column, row = math.floor(x / CELL) - self._origin[0], math.floor(y / CELL) - self._origin[1]
+    def use(self, means: Means) -> None:
+        """Compute by other means from now on."""
+        self._means = means
+        for own in self.evidence:
+            own.means = means
+
+    def layer(self, drone: int, source: int) -> NDArray[np.int8]:
+        """Return what a drone holds of source (a drone, too), int8 `[rows, columns]` of the level's grid; a view."""
+        own = self.evidence[drone]
+        row, column = (self.corner.row - own.corner.row) * TILE, (self.corner.column - own.corner.column) * TILE
+        cells = own.layers[source + 1].cells
+        return cells[row : row + self.tiles[0] * TILE, column : column + self.tiles[1] * TILE]
+
+    def versions(self, drone: int, source: int) -> NDArray[np.uint32]:
+        """Return the versions of the tiles of `layer`, uint32 `[tile rows, tile columns]`; a view."""
+        own = self.evidence[drone]
+        row, column = self.corner.row - own.corner.row, self.corner.column - own.corner.column
+        return own.layers[source + 1].versions[row : row + self.tiles[0], column : column + self.tiles[1]]
+
+    def integrate(self, drone: int, pose: Pose, scan: Scan, places: NDArray[np.float64]) -> Scan:
+        """Add a drone's scan to its own layer, and what that newly covers to its account.
+
+        Returns the scan without what lies on teammates at `places` `[n, 2]`, as it was mapped.
+        """
+        kept = Scan(scan.stamp, without_teammates(scan.ranges, self.lidar, pose, places, self.range_cap_m))
+        self.evidence[drone].integrate(pose, kept, self.lidar, self.range_cap_m)
+        self._count(drone, pose)
+        return kept
+
+    def _count(self, drone: int, pose: Pose) -> None:
+        """Mark as seen what a drone knows around itself."""
+        column, row = math.floor(pose.x / CELL) - self.origin[0], math.floor(pose.y / CELL) - self.origin[1]
         window = (
             slice(max(0, row - self._reach), max(0, row + self._reach + 1)),
             slice(max(0, column - self._reach), max(0, column + self._reach + 1)),
         )
-        fresh = (cells[window] != 0) & ~self.seen[window]
+        fresh = (self.layer(drone, drone)[window] != 0) & ~self.seen[window]
         self.seen[window] |= fresh
-        self.discovered[drone] += np.count_nonzero(fresh & self.coverable[window])
-
-
-class PlainMaps(CoverageAccount):
-    """Maps in numpy: `layers` int8 `[drones, sources, rows, columns]`, `versions` uint32 of their tiles."""
-
-    def __init__(self, level: Level, drones: int, lidar: LidarSpec, range_cap_m: float, ways: Ways) -> None:
-        """Make empty maps of a level's size; `ways` finds the cheapest ways to frontiers."""
-        super().__init__(level, drones, range_cap_m)
-        column0, row0, columns, rows = level.grid
-        self.drones, self.lidar, self.range_cap_m, self._ways = drones, lidar, range_cap_m, ways
-        self.origins = [(column0, row0)] * drones
-        self.layers = np.zeros((drones, drones, rows, columns), np.int8)
-        self.versions = np.zeros((drones, drones, rows // TILE, columns // TILE), np.uint32)
-        self.clocks = np.zeros(drones, np.uint32)
-        self.belief = np.zeros((drones, rows, columns), np.int8)
-        self.distance = [np.full((rows // 2, columns // 2), np.inf, np.float32) for _ in range(drones)]
-        self.states = [np.zeros((rows // 2, columns // 2), np.uint8) for _ in range(drones)]
-
-    def integrate(self, ranges: NDArray[np.float32], poses: NDArray[np.float64], connected: NDArray[np.bool_]) -> None:
-        """Add every drone's scan to its own layer, returns on teammates it hears left out, and advance its tiles."""
-        for drone, (x, y, yaw) in enumerate(poses.tolist()):
-            heard = poses[connected[drone], :2] - (x, y)
-            kept = without_teammates(ranges[drone], self.lidar.bearings + yaw, heard, self.range_cap_m)
-            cells = self.layers[drone, drone]
-            touched = integrate_scan(cells, self.origins[drone], (x, y, yaw), kept, self.lidar, self.range_cap_m)
-            if touched.any():
-                self.clocks[drone] += 1
-                self.versions[drone, drone][touched] = self.clocks[drone]
-            self.count(drone, cells, x, y)
-
-    def exchange(self, connected: NDArray[np.bool_], relays: bool, tiles_a_tick: int) -> None:
-        """Copy newer tiles along the links, each sender within its budget of tiles.
-
-        One broadcast serves every neighbour that lacks the tile; what a drone first gets in this tick waits for the
-        next.
-        """
-        held = self.versions > 0
-        for sender in range(self.drones):
-            budget = tiles_a_tick
-            for source in range(self.drones) if relays else (sender,):
-                receivers = [r for r in np.flatnonzero(connected[sender]).tolist() if r not in (sender, source)]
-                versions = self.versions[sender, source]
-                lacks = (self.versions[receivers, source] < versions) & held[sender, source]
-                for row, column in np.argwhere(lacks.any(axis=0))[:budget].tolist():
-                    budget -= 1
-                    self.tiles_sent[sender] += 1
-                    tile = np.s_[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
-                    for receiver, lacking in zip(receivers, lacks[:, row, column].tolist(), strict=True):
-                        if lacking:
-                            self.versions[receiver, source, row, column] = versions[row, column]
-                            self.layers[receiver, source][tile] = self.layers[sender, source][tile]
+        self.gained[drone] = np.count_nonzero(fresh & self.coverable[window])
+        self.discovered[drone] += self.gained[drone]
 
     def derive(self) -> None:
-        """Sum the layers of all sources into everyone's belief."""
-        self.belief = np.clip(self.layers.sum(axis=1, dtype=np.int16), -LIMIT, LIMIT).astype(np.int8)
-
-    def plan(self) -> None:
-        """Compute everyone's frontier field."""
-        for drone in range(self.drones):
-            self.states[drone] = plan_states(self.belief[drone])
-            self.distance[drone] = frontier_distances(self.states[drone], self._ways)
-
-    def observe(
-        self, drone: int, spec: ObservationSpec, pose: Pose3, velocity: NDArray[np.float64], ranges: NDArray[np.float32]
-    ) -> dict[str, NDArray[np.float32]]:
-        """Return what one drone's policy sees, named and shaped as `spec.shapes`."""
-        x, y, yaw = pose
-        turn = yaw if spec.axes == "heading" else 0.0
-        return {
-            "views": views(spec, self.belief[drone], self.distance[drone], self.origins[drone], (x, y), turn),
-            "lidar": sectors(ranges, self.lidar, yaw - turn, spec.lidar_sectors, spec.lidar_range_m),
-            "motion": motion(spec, velocity, turn),
-        }
-
-    def take_over(self, layers: NDArray[np.int8], versions: NDArray[np.uint32], clocks: NDArray[np.uint32]) -> None:
-        """Hold these layers `[drones, sources, rows, columns]`, tile versions and clocks from now on."""
-        self.layers[...], self.versions[...], self.clocks[...] = layers, versions, clocks
+        """Bring everyone's belief and frontier field up to date."""
+        drones = range(len(self.evidence))
+        self.beliefs = [self._means.belief([self.layer(drone, source) for source in drones]) for drone in drones]
+        self.fields = [self._means.field(belief) for belief in self.beliefs]

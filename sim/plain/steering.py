@@ -16,17 +16,48 @@ _BRAKING_SHARE = 0.7  # of the greatest acceleration
 _PASSES = 4
 
 
-def body_velocity(action: NDArray[np.float32], spec: ActionSpec, map_axes: bool, yaw: float) -> list[float]:
-    """Return (vx forward, vy left, yaw rate), m/s and rad/s, of an action in [-1, 1], clipped to it."""
-    ax, ay, *turn = np.clip(action.astype(np.float64), -1.0, 1.0).tolist()
+def intent(
+    action: NDArray[np.float32], spec: ActionSpec, map_axes: bool, pose: tuple[float, float, float]
+) -> tuple[float, ...]:
+    """Return what a decision taken at `pose` means from now on: a waypoint in the map, else the clipped action."""
+    clipped = np.clip(action.astype(np.float64), -1.0, 1.0).tolist()
+    if spec.mode != "waypoint":
+        return tuple(clipped)
+    x, y, yaw = pose
+    dx, dy = _shortened(*clipped)
+    if not map_axes:
+        dx, dy = math.cos(yaw) * dx - math.sin(yaw) * dy, math.sin(yaw) * dx + math.cos(yaw) * dy
+    return x + dx * spec.waypoint_range_m, y + dy * spec.waypoint_range_m
+
+
+def body_velocity(
+    intended: tuple[float, ...], spec: ActionSpec, map_axes: bool, pose: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Return (vx forward, vy left, yaw rate), m/s and rad/s, that an intent asks of a drone at `pose`."""
+    x, y, yaw = pose
     if spec.mode == "body":
-        return [ax * spec.speed_mps, ay * spec.speed_mps, turn[0] * spec.yaw_rate_rps]
-    length = max(1.0, math.hypot(ax, ay))
-    vx, vy = ax / length * spec.speed_mps, ay / length * spec.speed_mps
-    if map_axes:
+        forward, left, turn = intended
+        return forward * spec.speed_mps, left * spec.speed_mps, turn * spec.yaw_rate_rps
+    a, b = intended
+    if spec.mode == "forward":
+        return max(a, 0.0) * spec.speed_mps, 0.0, b * spec.yaw_rate_rps
+    if spec.mode == "waypoint":
+        response, braking = spec.waypoint_response_s, spec.waypoint_braking_mps2
+        away = math.hypot(a - x, b - y)
+        # stopping from v takes v response + v²/(2 braking) metres, solved for v
+        speed = min(spec.speed_mps, braking * (math.sqrt(response**2 + 2.0 * away / braking) - response))
+        vx, vy = (a - x) / max(away, 1e-9) * speed, (b - y) / max(away, 1e-9) * speed
+    else:
+        vx, vy = (part * spec.speed_mps for part in _shortened(a, b))
+    if map_axes or spec.mode == "waypoint":
         c, s = math.cos(yaw), math.sin(yaw)
         vx, vy = c * vx + s * vy, -s * vx + c * vy
-    return [vx, vy, 0.0]
+    return vx, vy, 0.0
+
+
+def _shortened(x: float, y: float) -> tuple[float, float]:
+    length = max(1.0, math.hypot(x, y))
+    return x / length, y / length
 
 
 def shielded(

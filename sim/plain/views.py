@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.frontier import PLAN_CELL
+from imagine.core.frontier import FAR, PAD, PLAN_CELL, UNIT_M
 from imagine.core.lidar import LidarSpec
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.raster import CELL, LIMIT
-from imagine.sim.plain.field import distance_at
+from imagine.sim.plain.field import cost_at
 
 _CRITIC_CHANNELS, _CRITIC_CELLS = 5, 32
 
@@ -21,61 +21,53 @@ _CRITIC_CHANNELS, _CRITIC_CELLS = 5, 32
 def views(
     spec: ObservationSpec,
     belief: NDArray[np.int8],
-    distance: NDArray[np.float32],
+    cost: NDArray[np.int16],
     origin: tuple[int, int],
     position: tuple[float, float],
     turn: float,
 ) -> NDArray[np.float32]:
     """Return occupancy and relative frontier distance around a position, float32 `[2 scales, n, n]`.
 
-    `belief` has its first cell at `origin` (column, row). A pixel reads the cell, or the block of cells aligned with
-    the map, that holds its centre; `turn` radians turn the views against the map.
+    `belief` has its first cell at `origin` (column, row), `cost` is `FrontierField.cost`. A pixel reads the cell, or
+    the block of cells aligned with the map, that holds its centre; `turn` radians turn the views against the map.
     """
     x, y = position
-    n = spec.view_cells
-    own = np.float32(
-        distance_at(
-            distance,
-            math.floor(x / PLAN_CELL) - origin[0] // 2,
-            math.floor(y / PLAN_CELL) - origin[1] // 2,
-        )
-    )
-    seen = np.empty((2 * len(spec.view_scales_m), n, n), np.float32)
-    cos_turn, sin_turn = math.cos(turn), math.sin(turn)
+    own = cost_at(cost, math.floor(x / PLAN_CELL) - origin[0] // 2, math.floor(y / PLAN_CELL) - origin[1] // 2)
+    inner = cost[PAD:-PAD, PAD:-PAD].astype(np.int32)
+    away = np.where(inner >= 0, inner, FAR)
+    seen = np.empty((2 * len(spec.view_scales_m), spec.view_cells, spec.view_cells), np.float32)
     for k, (scale, frontier_range) in enumerate(zip(spec.view_scales_m, spec.frontier_ranges_m, strict=True)):
         block = round(scale / CELL)
-        along = (np.arange(n) + 0.5 - 0.5 * n) * scale
-        u, v = along[None, :], along[:, None]
-        columns = np.floor((x + cos_turn * u - sin_turn * v) / scale).astype(int) - origin[0] // block
-        rows = np.floor((y + sin_turn * u + cos_turn * v) / scale).astype(int) - origin[1] // block
-        occupancy, nearest = _pooled_occupancy(belief, block), _pooled_distance(distance, max(1, block // 2))
-        seen[2 * k] = _at(occupancy, rows, columns, 0.0)
+        rows, columns = _blocks(spec.view_cells, scale, x, y, turn)
+        rows, columns = rows - origin[1] // block, columns - origin[0] // block
+        seen[2 * k] = _at(_pooled_occupancy(belief, block), rows, columns, 0.0)
+        nearest = functools.reduce(np.minimum, _parts(away, max(1, block // 2)))
         if block == 1:  # planning cells are two cells wide
             rows, columns = rows >> 1, columns >> 1
-        here = _at(nearest, rows, columns, np.inf)
-        known = np.isfinite(here) & np.isfinite(own)
-        relative = np.subtract(here, own, out=np.full_like(here, np.inf), where=known) / np.float32(frontier_range)
-        seen[2 * k + 1] = np.clip(relative, -1.0, 1.0)  # what is unknown, or leads nowhere, reads 1
+        further = _at(nearest - own, rows, columns, FAR).astype(np.float32) * np.float32(UNIT_M / frontier_range)
+        seen[2 * k + 1] = np.clip(further, -1.0, 1.0) if own < FAR else 1.0  # what leads nowhere reads 1
     return seen
+
+
+def _blocks(n: int, scale: float, x: float, y: float, turn: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return rows and columns, in blocks of the map frame, of all pixels' centres."""
+    if turn == 0.0:
+        along = np.arange(n) - n // 2
+        return math.floor(y / scale + 0.5) + along[:, None], math.floor(x / scale + 0.5) + along[None, :]
+    cos_turn, sin_turn = math.cos(turn), math.sin(turn)
+    centres = (np.arange(n) + 0.5 - 0.5 * n) * scale
+    u, v = centres[None, :], centres[:, None]
+    columns = np.floor((x + cos_turn * u - sin_turn * v) / scale).astype(int)
+    rows = np.floor((y + sin_turn * u + cos_turn * v) / scale).astype(int)
+    return rows, columns
 
 
 def _pooled_occupancy(belief: NDArray[np.int8], block: int) -> NDArray[np.float32]:
     """Return the belief of every block of cells in [-1, 1]: its strongest obstacle, else its mean."""
-    if block == 1:
-        return belief.astype(np.float32) / np.float32(LIMIT)
-    parts = _parts(belief, block)
+    parts = [part.astype(np.int32) for part in _parts(belief, block)]
     strongest = functools.reduce(np.maximum, parts)
-    pooled = np.zeros(strongest.shape, np.float32)
-    for part in parts:
-        pooled += part
-    pooled /= block * block
-    pooled[strongest > 0] = strongest[strongest > 0]
-    pooled /= LIMIT
-    return pooled
-
-
-def _pooled_distance(distance: NDArray[np.float32], block: int) -> NDArray[np.float32]:
-    return functools.reduce(np.minimum, _parts(distance, block))
+    pooled = np.where(strongest > 0, strongest * len(parts), functools.reduce(np.add, parts))
+    return pooled.astype(np.float32) * np.float32(1.0 / (LIMIT * len(parts)))
 
 
 def _parts(grid: NDArray[Any], block: int) -> list[NDArray[Any]]:
@@ -83,13 +75,11 @@ def _parts(grid: NDArray[Any], block: int) -> list[NDArray[Any]]:
     return [grid[i::block, j::block] for i in range(block) for j in range(block)]
 
 
-def _at(
-    grid: NDArray[np.float32], rows: NDArray[np.int64], columns: NDArray[np.int64], outside: float
-) -> NDArray[np.float32]:
+def _at(grid: NDArray[Any], rows: NDArray[np.int64], columns: NDArray[np.int64], outside: float) -> NDArray[Any]:
     """Return the grid's values at rows and columns, which broadcast to one shape; `outside` where the grid has none."""
     inside = (rows >= 0) & (rows < grid.shape[0]) & (columns >= 0) & (columns < grid.shape[1])
     values = grid[np.clip(rows, 0, grid.shape[0] - 1), np.clip(columns, 0, grid.shape[1] - 1)]
-    return np.where(inside, values, np.float32(outside))
+    return np.where(inside, values, grid.dtype.type(outside))
 
 
 def sectors(

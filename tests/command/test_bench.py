@@ -38,12 +38,21 @@ def test_a_quick_run_measures_shows_and_writes_everything(tmp_path: Path) -> Non
     assert status == 0, err
     told = json.loads(results.read_text())
     assert all({"value", "unit"} <= row.keys() for row in told.values())
-    expected = {"worlds_1", "worlds_4", "drones_1", "drones_2", "memory_a_drone", "time_growth_worlds", "cores"}
+    expected = {
+        "worlds_1",
+        "worlds_4",
+        "drones_1",
+        "drones_2",
+        "memory_a_drone",
+        "resident_a_drone",
+        "time_growth_worlds",
+        "cores",
+    }
     expected |= {f"{who}_360_beams" for who in ("batched", "plain", "plain_scipy", "plain_kernels")}
     expected |= {f"batched_over_{who}_360_beams_random" for who in ("plain", "plain_scipy", "plain_kernels")}
     assert expected <= told.keys()
     assert told["batched_over_plain_360_beams"]["per_cpu_s"] > 2.0
-    for text in ("plain-kernels", "Growth with worlds", "Growth with drones", "integration"):
+    for text in ("plain-kernels", "Growth with worlds", "Growth with drones", "observe", "rest", "MB a drone"):
         assert text in out
     assert "round 1 of" in err
     with Image.open(plot) as picture:

@@ -98,7 +98,7 @@ class TeamOnBoard:
         self.env, self.world, self.rules = env, world, env.air.rules
         self.drones = [OnBoard(env, world, drone) for drone in range(env.drones)]
         self.delivered = np.zeros((env.drones, env.drones), np.int64)
-        self.lost = 0
+        self.lost = self.relayed = 0
         self.said = np.zeros(4, np.int64)
         self._sealers = [Sealer(KEY, own.id, 1) for own in self.drones]
         self._in_flight: list[InFlight] = []
@@ -198,6 +198,7 @@ class TeamOnBoard:
             return scan
         if record["kind"] == TILES:
             source = int(record["source"]) + 1
+            self.relayed += source != own.id
             return messages.Tiles(source, [self._tile(source, place, version) for place, version in told])
         if record["kind"] == DIGEST:  # what it tells decides only what is sent, and that is the batch's affair here
             return messages.Digest(now, [])

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from imagine.core.frontier import FrontierField
+from imagine.core.lidar import Scan
 from imagine.sim.bench.comparison import comparison
 from imagine.sim.bench.growth import growth
 from imagine.sim.bench.laps import Laps, StageWatch, ratio
 from imagine.sim.bench.memory import array_bytes, free_bytes, resident_bytes
 from imagine.sim.bench.plan import BenchPlan, make_batch
-from imagine.sim.exploration import Observation
 
 SMALL = BenchPlan(
     level="0", beams=(360,), worlds=(1, 2, 8), drones=(1, 4), seconds=0.1, rounds=2,
@@ -25,16 +26,26 @@ SMALL = BenchPlan(
 
 def test_arrays_are_counted_once_whoever_looks_at_them() -> None:
     whole = np.zeros((100, 10))
-    seen = Observation({"a": whole[:50], "b": whole[50:], "c": np.zeros(3, np.float32)}, np.zeros(5, np.float32))
-    assert array_bytes(seen) == 8000 + 12 + 20
+    scan, field = Scan(0.0, np.zeros(3, np.float32)), FrontierField(np.zeros((4, 5), np.int16), np.zeros(9, np.uint8))
+    seen = {"a": whole[:50], "b": whole[50:], "c": scan, "d": field}
+    assert array_bytes(seen) == 8000 + 12 + 40 + 9
     assert array_bytes([seen, (seen, whole.T), {1: whole}]) == array_bytes(seen)
     assert array_bytes("text") == array_bytes(None) == 0
 
 
 def test_a_batchs_arrays_are_found_wherever_they_are_kept() -> None:
-    batch = make_batch(SMALL, 2, 2, 360)
-    least = batch.maps.layers.nbytes + batch.maps.belief.nbytes + batch.twin.poses.nbytes
+    batch = make_batch(SMALL, 32, 2, 360)
+    least = batch.maps.layers.nbytes + batch.maps.belief.nbytes + batch.twin.poses.nbytes + batch.air.state.known.nbytes
     assert least < array_bytes(batch) < 10 * least
+
+
+def test_a_drone_takes_no_more_than_a_megabyte_and_a_half_on_the_largest_level() -> None:
+    plan = BenchPlan(worlds=(8, 32), rounds=1, growth_ticks=30, seconds=0.05, compared_worlds=8, copies=1)
+    told = growth(plan, "worlds", lambda _: None)
+    for name in ("memory_a_drone", "resident_a_drone"):
+        assert 0.2e6 < told[name]["value"] <= 1.5e6, name
+        assert told[name]["drones"] == 3
+    assert told["worlds_32"]["array_bytes_a_drone"] <= 1.5e6
 
 
 def test_resident_memory_grows_by_what_is_written() -> None:
@@ -89,6 +100,8 @@ def test_stages_are_told_where_something_keeps_them() -> None:
     assert told["batched_stage_field_8_beams"] == {
         "value": pytest.approx(900.0), "unit": "us/agent-step", "share": pytest.approx(0.75),
     }  # fmt: skip
+    rest = watch.told("batched", "8_beams", 1000, cpu_s=1.5)["batched_stage_rest_8_beams"]
+    assert (rest["value"], rest["share"]) == (pytest.approx(300.0), pytest.approx(0.2))
     for silent in (Staged(None), object()):
         watch = StageWatch(silent)
         with watch:
@@ -106,9 +119,13 @@ def test_growth_is_told_by_size_and_memory_is_in_proportion_to_worlds() -> None:
         row = told[f"worlds_{worlds}"]
         assert (row["worlds"], row["drones"], row["unit"]) == (worlds, 2, "agent-steps/s")
         assert row["value"] == pytest.approx(worlds * 2 / row["tick_s"], rel=0.5)
-    assert told["memory_growth_worlds"]["value"] == pytest.approx(1.0, abs=0.15)
+    assert 0.3 < told["memory_growth_worlds"]["value"] < 1.1
     assert 0.2 < told["time_growth_worlds"]["value"] < 1.5
-    assert told["memory_a_drone"]["value"] == told["worlds_8"]["array_bytes_a_drone"]
+    line = told["memory_a_drone"]
+    assert line["off"] < 0.05
+    assert line["value"] * 8 * 2 + line["fixed"] == pytest.approx(
+        told["worlds_8"]["array_bytes_a_drone"] * 16, rel=0.05
+    )
 
 
 def test_a_size_that_would_not_fit_is_left_out_and_says_why() -> None:
@@ -128,12 +145,16 @@ def test_the_batched_step_is_compared_with_each_plain_one() -> None:
             assert rate["low"] <= rate["value"] <= rate["high"]
             assert faster["per_cpu_s"] == pytest.approx(batched["per_cpu_s"] / rate["per_cpu_s"], rel=0.5)
         assert told[f"batched_over_plain_{ending}"]["per_cpu_s"] > 2.0
-    shares = [row["share"] for name, row in told.items() if name.startswith("plain_stage_")]
-    assert len(shares) == 9
-    assert math.fsum(shares) == pytest.approx(1.0)
+    stages = ("fly", "scan", "share", "derive", "observe", "rest")
+    for who in ("batched", "plain", "plain_scipy", "plain_kernels"):
+        shares = [told[f"{who}_stage_{stage}_360_beams"]["share"] for stage in stages]
+        assert min(shares) > 0.0
+        assert math.fsum(shares) == pytest.approx(1.0)
+    batched = [told[f"batched_stage_{stage}_360_beams"]["value"] for stage in stages]
+    assert math.fsum(batched) == pytest.approx(1e6 / told["batched_360_beams"]["per_cpu_s"], rel=0.5)
+    assert told["plain_critic_360_beams"]["value"] > 0.0
 
 
-@pytest.mark.xfail(strict=True, reason="Exploration takes the preset's beams, not settings.lidar_spec")
 def test_the_beams_that_are_measured_are_flown() -> None:
     assert make_batch(SMALL, 1, 1, 64).lidar.beams == 64
 

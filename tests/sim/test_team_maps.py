@@ -1,4 +1,4 @@
-"""What drones of a batch make of their scans and of what they hold of others: as on board, and only where it changed."""
+"""What drones of a batch make of their scans and of what they hold of others: as on board, where it changed."""
 
 from __future__ import annotations
 

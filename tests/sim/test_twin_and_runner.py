@@ -87,6 +87,7 @@ def test_a_batched_drone_knows_what_a_runner_would_know(
         actions = np.nan_to_num(planned)
         actions[..., 2] = 0.5 * np.sin(tick / 7.0 + np.arange(3))  # they turn as they go
         seen = env.step(actions).observation
+    assert (sum(team.relayed for team in teams) > 0) == (protocol == "multi-hop")
     for team in teams:
         assert (team.lost > 0) == ("loss" in radio)
         assert team.said[STATUS] > 0
