@@ -63,7 +63,9 @@ class LidarOdometry:
         increments are used. Nothing raises: a scan that cannot be matched gives `ok` false and a reason.
         """
         motion = self._predicted_motion(yaw_prior)
-        cloud = deskewed_points(scan, self.spec, motion) if self.settings.deskew else points(scan, self.spec)
+        cloud = points(scan, self.spec)
+        if self.settings.deskew:
+            cloud = deskewed_points(scan, self.spec, motion, self.settings.clockwise)
         source = _thin(cloud, self.settings.source_voxel_m)
         guess = compose(self.pose, motion)
         elapsed = 0.0 if self._stamp is None else scan.stamp - self._stamp

@@ -28,3 +28,4 @@ class OdometrySettings(Settings):
     deskew: bool = Field(
         default=False, description="beams come one after another: put each where the end of the turn would have seen it"
     )
+    clockwise: bool = Field(default=False, description="for deskewing: the sensor turns clockwise, as seen from above")

@@ -91,4 +91,5 @@ class Perception:
         if self._stamp is None:
             return scan
         share = min(1.0, 1.0 / (self._spec.rate_hz * (scan.stamp - self._stamp)))
-        return deskewed_scan(scan, self._spec, Pose(delta.x * share, delta.y * share, delta.yaw * share))
+        motion = Pose(delta.x * share, delta.y * share, delta.yaw * share)
+        return deskewed_scan(scan, self._spec, motion, self.settings.odometry.clockwise)

@@ -20,11 +20,14 @@ from imagine.onboard.settings import DroneSettings, LaunchPose
 START = Pose(4.6, 3.5, 0.4)
 
 
-def turn(start: Pose, motion: Pose, spec: LidarSpec) -> NDArray[np.float32]:
+def turn(start: Pose, motion: Pose, spec: LidarSpec, clockwise: bool = False) -> NDArray[np.float32]:
     """Return the ranges of a turn that begins at `start` and ends after `motion`, beams taken one after another."""
     ranges = np.empty(spec.beams, np.float32)
-    for beam in range(spec.beams):
-        share = 1.0 - (1.0 - beam / spec.beams) * spec.fov / (2.0 * math.pi)
+    beams = list(range(spec.beams))
+    if clockwise:
+        beams = [0, *beams[:0:-1]] if spec is LD19 else beams[::-1]
+    for number, beam in enumerate(beams):
+        share = 1.0 - (1.0 - number / spec.beams) * spec.fov / (2.0 * math.pi)
         part = Pose(motion.x * share, motion.y * share, motion.yaw * share)
         ranges[beam] = cast(compose(start, part), spec)[beam]
     return ranges
@@ -43,10 +46,11 @@ def off_m(ranges: NDArray[np.float32], true: NDArray[np.float64]) -> NDArray[np.
 @pytest.mark.parametrize(
     "motion", [Pose(0.08, 0.0, 0.0), Pose(0.05, -0.05, 0.3), Pose(0.0, 0.0, -0.3)], ids=["along", "both", "turning"]
 )
-def test_a_scan_is_what_the_end_of_its_turn_would_have_given(spec: LidarSpec, motion: Pose) -> None:
-    skewed = turn(START, motion, spec)
+@pytest.mark.parametrize("clockwise", [False, True], ids=["ccw", "cw"])
+def test_a_scan_is_what_the_end_of_its_turn_would_have_given(spec: LidarSpec, motion: Pose, clockwise: bool) -> None:
+    skewed = turn(START, motion, spec, clockwise)
     true = cast(compose(START, motion), spec)
-    found = deskewed_scan(Scan(1.0, skewed), spec, motion)
+    found = deskewed_scan(Scan(1.0, skewed), spec, motion, clockwise)
     assert found.stamp == 1.0
     valid = ~np.isnan(found.ranges)
     assert valid.mean() > 0.9 - abs(motion.yaw) / spec.fov  # what turned out of sight is not seen

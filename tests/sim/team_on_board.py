@@ -106,10 +106,21 @@ class TeamOnBoard:
         self._packed: dict[tuple[int, TileKey, int], bytes] = {}
         self._said_until = np.full(env.drones, -1)
         self._nodes = env.air.state.nodes[self.world].copy()
+        self._nodes["next_scan"], self._nodes["scan_clock"] = -np.inf, 0  # as before the launch, when none was sent yet
         column, row = (int(number) * CELL for number in env.maps.origins[self.world])
         rows, columns = env.maps.belief.shape[2:]
         for own in self.drones:
             own.evidence.cover(column, row, column + columns * CELL - 0.05, row + rows * CELL - 0.05)
+        self._meet()
+
+    def _meet(self) -> None:
+        """Let those in reach hear what the others had to tell before they explored, as the batch does at a launch."""
+        for own in self.drones:
+            for peer in self.drones:
+                if self.env.air.state.reach[self.world, peer.at[1], own.at[1]]:
+                    x, y, yaw = (float(number) for number in self.env.estimates[peer.at])
+                    status = messages.Status(peer.id, 0.0, Pose(x, y, yaw), (0.0, 0.0), ladder="climb")
+                    own.node.receive(self._sealers[peer.at[1]].seal(messages.encode(status)), 0.0)
 
     def tick(self) -> None:
         """Hear, look and speak as the batch did in the tick that it has just flown."""

@@ -165,6 +165,18 @@ def test_the_seed_decides_everything() -> None:
     assert flat(fly(env, seed=4)) != flat(first)
 
 
+def test_what_was_told_stays_as_it_was_told() -> None:
+    """Learners keep observations for later, and the batch behind writes into arrays of its own."""
+    env, rng = ExplorationEnv(SMALL), np.random.default_rng(5)
+    kept: list[Any] = [env.reset(seed=3)]
+    then = [flat(kept[0])]
+    for _ in range(5):
+        kept.append(env.step(random_actions(env, rng)))
+        then.append(flat(kept[-1]))
+    env.reset()
+    assert [flat(told) for told in kept] == then
+
+
 def test_without_a_seed_every_episode_is_another_one() -> None:
     env = ExplorationEnv(SMALL)
     first, _ = env.reset(seed=1)
