@@ -18,15 +18,12 @@ def without_teammates(
     lidar: LidarSpec,
     pose: tuple[float, float, float],
     places: NDArray[np.float64],
-    range_cap_m: float,
 ) -> NDArray[np.float32]:
     """Return the ranges `[beams]` with returns on teammates at `places` `[n, 2]` (map frame) made invalid (nan)."""
     x, y, yaw = pose
     c, s = math.cos(yaw), math.sin(yaw)
     kept = ranges.copy()
     for dx, dy in places - (x, y):
-        if dx * dx + dy * dy > (range_cap_m + TEAMMATE_RADIUS_M) ** 2:
-            continue  # behind all that is mapped
         ahead, left = c * dx + s * dy, -s * dx + c * dy
         with np.errstate(invalid="ignore"):  # no return is infinitely far away
             ex, ey = kept * np.cos(lidar.bearings) - ahead, kept * np.sin(lidar.bearings) - left

@@ -90,7 +90,7 @@ class PlainMaps:
 
         Returns the scan without what lies on teammates at `places` `[n, 2]`, as it was mapped.
         """
-        kept = Scan(scan.stamp, without_teammates(scan.ranges, self.lidar, pose, places, self.range_cap_m))
+        kept = Scan(scan.stamp, without_teammates(scan.ranges, self.lidar, pose, places))
         self.evidence[drone].integrate(pose, kept, self.lidar, self.range_cap_m)
         self._count(drone, pose)
         return kept

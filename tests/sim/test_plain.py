@@ -47,10 +47,10 @@ ALONE = {
 }
 SHARING: dict[str, dict[str, Any]] = {
     "one-hop": {"levels": ("6",), "protocol": "one-hop"},
-    "multi-hop": {"protocol": "multi-hop", "drones": 4, "radio": RadioSettings(range_m=1.5)},
+    "multi-hop": {"levels": ("4",), "protocol": "multi-hop", "drones": 4, "radio": RadioSettings(range_m=3.0)},
     "64 beams behind walls": {
         "levels": ("4",), "protocol": "one-hop", "lidar_beams": 64,
-        "radio": RadioSettings(model="path-loss", threshold_dbm=-50.0),
+        "radio": RadioSettings(model="path-loss", threshold_dbm=-60.0),
     },
 }  # fmt: skip
 
@@ -171,8 +171,8 @@ def test_with_exchange_own_maps_are_the_same_and_the_rest_is_within_a_tenth(rule
         same_own_maps(plain, env, 0)
         mine, theirs = known(plain, env, 0)
         apart.append(np.abs(mine / theirs - 1.0))
-    alone = (plain.maps.layer(0, 0) != 0).sum()
-    assert known(plain, env, 0)[0][0] > 1.1 * alone
+    alone = np.array([np.count_nonzero(plain.maps.layer(drone, drone)) for drone in range(env.drones)])
+    assert (known(plain, env, 0)[0] / alone).max() > 1.2  # so there is something to be wrong about
     assert np.max(apart) < 0.1
     assert np.mean(apart) < 0.01
     mine, theirs = plain.mesh.bytes_sent(), env.air.bytes_sent[0]

@@ -85,12 +85,12 @@ def test_a_line_without_length_has_no_cells() -> None:
 
 
 def test_returns_on_teammates_are_left_out_and_no_others() -> None:
-    lidar = LidarSpec(beams=4)  # east, north, west and south of a drone that looks north-east by 45 degrees less
+    lidar = LidarSpec(beams=4)
     ranges = np.array([2.0, 2.0, np.inf, 4.3], np.float32)
     places = np.array([[3.1, 1.05], [-2.0, 1.0], [1.0, -3.3], [50.0, 0.0]])
-    kept = without_teammates(ranges, lidar, (1.0, 1.0, 0.0), places, 4.0)
-    np.testing.assert_array_equal(kept, [np.nan, 2.0, np.inf, np.float32(4.3)])  # the last is behind all that is mapped
-    turned = without_teammates(ranges, lidar, (1.0, 1.0, -math.pi / 2), places, 4.0)
+    kept = without_teammates(ranges, lidar, (1.0, 1.0, 0.0), places)
+    np.testing.assert_array_equal(kept, [np.nan, 2.0, np.inf, np.nan])
+    turned = without_teammates(ranges, lidar, (1.0, 1.0, -math.pi / 2), places)
     np.testing.assert_array_equal(turned, [2.0, np.nan, np.inf, np.float32(4.3)])
 
 
