@@ -263,6 +263,7 @@ def _check(settings: ExplorationSettings) -> None:
     lacking = {
         "dynamics": settings.dynamics != DynamicsSettings(),
         "sensing": settings.sensing != LidarModel(),
+        "drift": settings.drift.enabled,
         "observation: position, heading, peers, visits": settings.observation.version != 1,
     }
     for name, is_asked_for in lacking.items():
