@@ -17,6 +17,7 @@ import numpy as np
 from imagine.onboard.settings import DroneSettings
 from imagine.sim.coverage import Coverage
 from imagine.sim.level import load_level
+from imagine.sim.radio import RadioMedium, RadioSettings
 from imagine.sim.twin import Twin
 
 _TWIN_DEADLINE_S = 300.0
@@ -52,6 +53,7 @@ def warm_twin() -> None:
     twin = Twin([level], drones=2)
     scans = twin.scan()[0]
     Coverage(level, 2, twin.lidar, range_cap_m=4.0).update(twin.poses[0], scans)
+    RadioMedium(2, RadioSettings(), np.random.default_rng(0), level.segments).in_reach(twin.poses[0])
     twin.step(np.zeros((1, 2, 3)))
 
 

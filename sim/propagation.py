@@ -60,6 +60,8 @@ def crossings(ax, ay, bx, by, segments, most):  # type: ignore[no-untyped-def]
     loop they belong to once, and one that touches the corner crosses it twice or not at all. A segment that the line
     runs along is not crossed.
     """
+    if bx < ax or (bx == ax and by < ay):  # which end comes first must not matter where a wall ends on the line
+        ax, ay, bx, by = bx, by, ax, ay
     low_x, high_x = min(ax, bx), max(ax, bx)
     low_y, high_y = min(ay, by), max(ay, by)
     dx, dy = bx - ax, by - ay

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -108,6 +108,7 @@ points = st.tuples(coordinate, coordinate)
 
 
 @given(points, points, st.lists(st.tuples(coordinate, coordinate, coordinate, coordinate), max_size=8))
+@example((0.0, -1.0), (0.0, 2.0), [(0.0, 0.0, 1.0, 0.0)])  # a wall that ends on the line
 def test_reach_is_mutual_and_between_that_behind_walls_and_that_in_the_clear(
     a: tuple[float, float], b: tuple[float, float], walls: list[tuple[float, float, float, float]]
 ) -> None:
