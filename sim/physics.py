@@ -107,6 +107,12 @@ def prepare_tally(api, world, tally, bodies, counts, last_touch):  # type: ignor
         last_touch[kind, world, :] = NEVER
 
 
+@numba.njit(cache=True, nogil=True)
+def fastest_mps(radius):  # type: ignore[no-untyped-def]
+    """Return how fast a disc of this radius (m) may be so that no substep carries its centre past what it touches."""
+    return 0.75 * radius / SUBSTEP_S
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def step_worlds(  # type: ignore[no-untyped-def]
     first, last, setpoints, api, spaces, bodies, shapes, tally, counts, last_touch, contacts, ages, keys, poses,
@@ -164,9 +170,12 @@ def step_worlds(  # type: ignore[no-untyped-def]
             for drone in range(drones):
                 if not alive[world, drone]:
                     continue
-                velocity[world, drone, 0], velocity[world, drone, 1] = call_vector(
-                    api[BODY_VELOCITY], (bodies[world, drone],)
-                )
+                vx, vy = call_vector(api[BODY_VELOCITY], (bodies[world, drone],))
+                share = fastest_mps(radius) / max(math.sqrt(vx * vx + vy * vy), 1e-9)
+                if share < 1.0:  # gusts and shoves: any faster, and a substep could carry it through a wall
+                    vx, vy = vx * share, vy * share
+                    call_void(api[BODY_SET_VELOCITY], (bodies[world, drone], vx, vy))
+                velocity[world, drone, 0], velocity[world, drone, 1] = vx, vy
                 if crowded:
                     x, y = call_vector(api[BODY_POSITION], (bodies[world, drone],))
                     if touches_person(world, x, y, people, radius):

@@ -20,9 +20,10 @@ from imagine.core.vehicle_limits import VehicleLimits
 from imagine.sim.chipmunk import addresses
 from imagine.sim.dynamics import COLUMNS, HISTORY, TICK_S, DynamicsSettings
 from imagine.sim.level import Level
+from imagine.sim.level_survey import LAUNCH_CLEARANCE_M
 from imagine.sim.lidar_model import LidarModel
 from imagine.sim.movers import Movers
-from imagine.sim.physics import DRONES, MOVERS, TALLY_COLUMNS, WALLS, prepare_tally, step_worlds, touched
+from imagine.sim.physics import DRONES, MOVERS, TALLY_COLUMNS, WALLS, fastest_mps, prepare_tally, step_worlds, touched
 from imagine.sim.scan_world import Sensors
 from imagine.sim.sensing import Sensing
 from imagine.sim.solids import Solids, build_space, free_space
@@ -69,6 +70,7 @@ class Twin:
         self.lidar = lidar
         self.limits = limits or VehicleLimits()
         self.dynamics = dynamics or DynamicsSettings()
+        _check_limits(self.limits)
         self.seed = seed
         self.ticks = 0
         self.workers = Workers()
@@ -218,6 +220,21 @@ class Twin:
             self.poses, self.velocity, self.limits.radius_m, self.ticks, self.mover_discs, self.mover_edges,
             alive=self.alive,
         )  # fmt: skip
+
+
+def _check_limits(limits: VehicleLimits) -> None:
+    """Refuse what the twin cannot keep out of walls, or cannot launch."""
+    fastest = fastest_mps(limits.radius_m)
+    if limits.speed_mps > fastest:
+        raise InputError(
+            f"limits: speed_mps is {limits.speed_mps:g}, but the twin holds a drone of radius {limits.radius_m:g} m "
+            f"out of walls up to {fastest:.2g} m/s only: lower the speed"
+        )
+    if limits.radius_m > LAUNCH_CLEARANCE_M:
+        raise InputError(
+            f"limits: radius_m is {limits.radius_m:g}, but levels launch drones {LAUNCH_CLEARANCE_M:g} m off walls: "
+            "give a smaller radius"
+        )
 
 
 def _widened(array: NDArray[np.int64], columns: int) -> NDArray[np.int64]:

@@ -9,8 +9,10 @@ import numba
 import numpy as np
 import pymunk
 import pymunk._chipmunk_cffi as chipmunk
+import pytest
 from numpy.typing import NDArray
 
+from imagine.core.errors import InputError
 from imagine.core.lidar import LidarSpec
 from imagine.core.vehicle_limits import VehicleLimits
 from imagine.sim.chipmunk import (
@@ -204,3 +206,37 @@ def test_no_drone_is_ever_in_a_wall_in_a_million_steps_at_full_speed() -> None:
     assert deepest > RADIUS_M - DEEPEST_M - 1e-6
     assert twin.ticks * 64 * 3 > 1_000_000
     assert contacts > 5000
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "limits"),
+    [
+        (DynamicsSettings(wind_mps=2.0), VehicleLimits()),
+        (DynamicsSettings(wind_mps=2.0, mass_kg=0.01), VehicleLimits(acceleration_mps2=30.0, lag_s=0.0)),
+        (DynamicsSettings(), VehicleLimits(speed_mps=3.0, acceleration_mps2=30.0, lag_s=0.0)),
+        (DynamicsSettings(), VehicleLimits(speed_mps=1.1, acceleration_mps2=30.0, lag_s=0.0, radius_m=0.03)),
+    ],
+    ids=["storm", "light in a storm", "fast", "small"],
+)
+def test_nor_at_the_edge_of_what_may_be_set(dynamics: DynamicsSettings, limits: VehicleLimits) -> None:
+    names = ("4", "5", "6", "3")
+    levels = [load_level(names[world % 4]) for world in range(16)]
+    twin = Twin(levels, 4, FEW_BEAMS, limits, 3, dynamics)
+    rng = np.random.default_rng(1)
+    setpoints = full_speed(rng, 16, 4) * limits.speed_mps / VehicleLimits().speed_mps
+    for tick in range(1500):
+        if tick % 8 == 0:
+            setpoints = full_speed(rng, 16, 4) * limits.speed_mps / VehicleLimits().speed_mps
+        twin.step(setpoints)
+        if tick % 5 == 0:
+            for index in range(4):
+                assert levels[index].is_free(twin.poses[index::4, :, :2].reshape(-1, 2)).all()
+    assert twin.wall_contacts.sum() > 100
+
+
+def test_what_the_twin_cannot_keep_out_of_walls_is_refused() -> None:
+    level = load_level("0")
+    with pytest.raises(InputError, match=r"speed_mps is 5.*3 m/s"):
+        Twin([level], 1, FEW_BEAMS, VehicleLimits(speed_mps=5.0))
+    with pytest.raises(InputError, match=r"radius_m is 0\.5"):
+        Twin([level], 1, FEW_BEAMS, VehicleLimits(radius_m=0.5))
