@@ -6,6 +6,7 @@ new scans become evidence, maps over the radio, observations and reward.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -119,6 +120,7 @@ class Exploration:
         self.estimates = self.twin.poses if self._drift is None else self.twin.poses.copy()
         self._specs = _specs(settings, self.decisions)
         self.stage_seconds: dict[str, float] = {}
+        self._timing = threading.Lock()
         self._sight_m = max(cap + 2.0 * TEAMMATE_RADIUS_M, settings.observation.lidar_range_m)
         self._keys = root_keys(seed ^ _AIR_KEY, np.array(keys))
         self._turns = np.zeros(worlds, np.int64)
@@ -281,7 +283,8 @@ class Exploration:
         def add(stage: str) -> None:
             nonlocal before
             now = time.thread_time()
-            self.stage_seconds[stage] += now - before
+            with self._timing:
+                self.stage_seconds[stage] += now - before
             before = now
 
         return add
