@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from imagine.core.errors import InputError
 from imagine.core.raster import CELL
@@ -61,7 +61,9 @@ def show_level(name: str, image: Path | None, json_file: Path | None) -> None:
 
 def check_levels(names: list[str], json_file: Path | None) -> None:
     """Print each level's figures, or why it cannot be explored. Raises InputError if there are any of these."""
-    table = Table("level", "size, m", "free, m²", "to cover, cells", "flyable", "drones", "passage", box=None)
+    figures = ("size, m", "free, m²", "to cover, cells", "flyable", "drones", "passage")
+    name_column = Column("level", overflow="fold")  # cut off, long paths in one folder would read the same
+    table = Table(name_column, *figures, box=None)
     rows: list[dict[str, Any]] = []
     refused: list[str] = []
     console = Console()

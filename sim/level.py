@@ -167,8 +167,9 @@ class Level:
         chosen = np.empty(drones, np.int64)
         found = choose_apart(spots, x, y, drones, _LAUNCH_SPACING_M, chosen)
         if found < drones:
+            room = "1 drone" if found == 1 else f"{found} drones"
             raise InputError(
-                f"level {self.name}: room for {found} drones around ({x:g}, {y:g}), not {drones}: "
+                f"level {self.name}: room for {room} around ({x:g}, {y:g}), not {drones}: "
                 "they start 0.7 m apart and 0.25 m from anything; take fewer, or a larger level"
             )
         headings = np.zeros(drones) if generator is None else generator.uniform(-math.pi, math.pi, drones)

@@ -21,9 +21,9 @@ def open_level(name: str) -> Level:
         return read_level(name, f"level {name}", *parse_yaml(text, f"level {name}"))
     if name.startswith(PREFIX):
         return level_by_seed(name)
-    file, at, scale = name.rpartition("@")
+    file, at, _ = name.rpartition("@")
     if at and Path(file).suffix.lower() in IMAGE_SUFFIXES:
-        return load_image(Path(file), scale)
+        return load_image(name)
     path = Path(name)
     suffix = path.suffix.lower()
     if suffix in IMAGE_SUFFIXES:

@@ -18,7 +18,7 @@ from scipy import ndimage
 from imagine.core.config import KeyPath, Settings, check_settings
 from imagine.core.errors import InputError
 from imagine.sim.level import Crate, Level, Person, Point
-from imagine.sim.level_check import LARGEST_M, Place, check_extent, check_level
+from imagine.sim.level_check import HIDDEN_AREA_M2, LARGEST_M, Place, check_extent, check_level
 from imagine.sim.level_survey import LAUNCH_CLEARANCE_M
 from imagine.sim.pixel_loops import boundary_loops, simplified, without_pinches
 from imagine.sim.polygon import signed_area
@@ -50,21 +50,32 @@ class MapFile(Settings):
 def load_map(path: Path, data: dict[str, Any], lines: dict[KeyPath, int]) -> Level:
     """Return a map's YAML as a level. Raises InputError naming file and line."""
     file = check_settings(MapFile, data, str(path), lines)
+    if file.occupied_thresh < file.free_thresh:
+        line = lines.get(("occupied_thresh",)) or lines.get(("free_thresh",), 1)
+        raise InputError(
+            f"{path}:{line}: occupied_thresh: {file.occupied_thresh:g} is below free_thresh, {file.free_thresh:g}: "
+            "a pixel is free below the one and occupied above the other; raise it, or lower free_thresh"
+        )
     image = Path(file.image)
     where = f"{path}:{lines.get(('image',), 1)}"
     return _level_of(path.stem, path.parent / image, file, where, lines, str(path))
 
 
-def load_image(path: Path, scale: str) -> Level:
-    """Return an image as a level, its lower left corner at (0, 0); `scale` says the metres a pixel."""
+def load_image(name: str) -> Level:
+    """Return an image as a level, its lower left corner at (0, 0).
+
+    The name, such as "plan.png@0.05", says the metres a pixel. Raises InputError quoting it.
+    """
+    file_name, _, scale = name.rpartition("@")
+    path = Path(file_name)
     try:
         resolution = float(scale)
     except ValueError:
         resolution = math.nan
     if not 0.0 < resolution <= 10.0:
-        raise InputError(f"level {path}@{scale}: after the @ come metres a pixel, above 0 and at most 10, such as 0.05")
+        raise InputError(f"level {name}: after the @ come metres a pixel, above 0 and at most 10, such as 0.05")
     file = MapFile(image=path.name, resolution=resolution)
-    return _level_of(path.stem, path, file, f"level {path}", {}, f"level {path}")
+    return _level_of(path.stem, path, file, f"level {name}", {}, f"level {name}")
 
 
 def _level_of(name: str, image: Path, file: MapFile, where: str, lines: dict[KeyPath, int], whole: str) -> Level:
@@ -129,7 +140,7 @@ def free_pixels(
     """Tell which pixels are free by map_server's rule: neither occupied nor unknown.
 
     The probability of being occupied is the darkness, or with `negate` the lightness; free is below `free_thresh`,
-    unless `occupied_thresh` is lower still. Transparent (nan) is unknown.
+    unless `occupied_thresh` is lower still, which maps may not say. Transparent (nan) is unknown.
     """
     occupied = shades if negate else 1.0 - shades
     free: NDArray[np.bool_] = (occupied < free_thresh) & ~(occupied > occupied_thresh)
@@ -170,13 +181,43 @@ def _region(
             raise InputError(
                 f"{place('launch')}: launch ({launch[0]:g}, {launch[1]:g}) lies on no free pixel of the image"
             )
-        return labels == labels[row, column], launch
+        return _checked(labels, int(labels[row, column]), frame, place), launch
     room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1]
-    edge = np.concatenate((labels[0], labels[-1], labels[:, 0], labels[:, -1]))
-    indoors = np.where(np.isin(labels, edge), 0.0, room)  # what reaches the image's edge is outdoors
+    indoors = np.where(np.isin(labels, _outdoors(labels)), 0.0, room)
     if indoors.max() * frame.resolution >= LAUNCH_CLEARANCE_M + frame.resolution:
         room = indoors
     best = int(np.argmax(np.round(room, 6)))
     row, column = best // room.shape[1], best % room.shape[1]
     x, y = frame.to_map(np.array([[column + 0.5, row + 0.5]]))[0]
-    return labels == labels[row, column], (float(x), float(y))
+    return _checked(labels, int(labels[row, column]), frame, place), (float(x), float(y))
+
+
+def _outdoors(labels: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the numbers of the regions that reach the image's edge: these are outdoors. 0, not free, is among them."""
+    return np.unique(np.concatenate((labels[0], labels[-1], labels[:, 0], labels[:, -1], [0])))
+
+
+def _checked(labels: NDArray[np.int32], launched: int, frame: _Frame, place: Place) -> NDArray[np.bool_]:
+    """Return the launch's region. Raises InputError where another of 0.25 m² or more is closed in, naming the largest.
+
+    A closed room would otherwise be taken for solid without a word; the plan's author believes it can be explored.
+    """
+    outdoors = _outdoors(labels)
+    areas = np.bincount(labels.ravel()) * frame.resolution**2
+    areas[outdoors] = areas[launched] = 0.0
+    closed = int(np.argmax(areas))
+    if areas[closed] >= HIDDEN_AREA_M2 - 1e-9:
+        depth = ndimage.distance_transform_edt(labels == closed)  # closed in: the image's edge is none of its own
+        row, column = np.unravel_index(np.argmax(np.round(depth, 6)), labels.shape)
+        x, y = frame.to_map(np.array([[column + 0.5, row + 0.5]]))[0]
+        # From indoors another launch would leave this one's region closed in; from outdoors it would not.
+        remedy = (
+            "fill it in, open the wall, or give another launch"
+            if launched in outdoors
+            else ("fill it in, or open the wall")
+        )
+        raise InputError(
+            f"{place('image')}: {areas[closed]:.2f} m² around ({x:.2f}, {y:.2f}) are closed in and cannot be reached "
+            f"from the launch: {remedy}"
+        )
+    return labels == launched

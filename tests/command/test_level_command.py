@@ -18,10 +18,12 @@ from imagine.sim.level import BUILT_IN, load_level
 from imagine.sim.level_image import draw_level
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path, status: int = 0) -> tuple[str, str]:
+def run(
+    capsys: pytest.CaptureFixture[str], *arguments: str | Path, status: int = 0, columns: int = 160
+) -> tuple[str, str]:
     """Run the command here; return what it says on standard output and standard error."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("COLUMNS", "160")
+        patch.setenv("COLUMNS", str(columns))
         patch.setattr(sys, "argv", ["imagine", "level", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
             main()
@@ -101,6 +103,21 @@ def test_check_measures_what_is_good_and_ends_with_2_where_something_is_not(
     assert "2 of 3 levels cannot be explored, the first: " in err
     assert out.count("refused: ") == 2
     assert [sorted(row)[:1] for row in read(tmp_path / "out.json")] == [["coverable_cells"], ["error"], ["error"]]
+
+
+def test_check_writes_long_names_in_full(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    folder = tmp_path / ("a_long_name_of_a_folder_" * 4)
+    folder.mkdir()
+    names = [folder / f"floor-{number}-of-the-hall.yaml" for number in (1, 2)]
+    for name, width in zip(names, (3, 4), strict=True):
+        name.write_text(f"size_m: [{width}, 3]\nlaunch: [1, 1]\n")
+    out, _ = run(capsys, "check", *names, columns=80)
+    written = "".join(line[: line.find("  ")] if "  " in line else line for line in map(str.strip, out.splitlines()))
+    assert "…" not in out
+    for name in names:
+        assert str(name) in written, out
+    for figure in ("3 × 3", "4 × 3", "16 or more", "above 1 m"):
+        assert figure in out
 
 
 def test_generate_writes_a_file_that_is_the_house(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

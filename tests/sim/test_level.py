@@ -109,8 +109,15 @@ def test_random_launches_are_apart_free_and_repeat_with_the_generator() -> None:
 
 
 def test_a_room_too_small_for_the_team_says_so() -> None:
-    with pytest.raises(InputError, match=r"room for .* not 500"):
+    with pytest.raises(InputError, match=r"room for \d+ drones around .* not 500"):
         LEVELS["0"].launch_poses(500)
+
+
+def test_room_for_a_single_drone_is_told_as_one(tmp_path: Path) -> None:
+    level = load_level(write(tmp_path, "size_m: [1.0, 1.0]\nlaunch: [0.5, 0.5]\n"))
+    assert len(level.launch_poses(1)) == 1
+    with pytest.raises(InputError, match=r"room for 1 drone around \(0\.5, 0\.5\), not 2: "):
+        level.launch_poses(2)
 
 
 def write(folder: Path, text: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -101,11 +102,64 @@ def test_transparent_is_unknown_and_colours_count_by_their_lightness(tmp_path: P
 def test_only_what_hangs_together_with_the_launch_is_the_level(tmp_path: Path) -> None:
     picture = plan()
     picture[10:80, 58:62] = WALL  # two rooms without a door
+    picture[40:50, :10] = FREE  # each leads out to the image's edge
+    picture[40:50, 110:] = FREE
     left = load_level(write(tmp_path, picture, "launch: [1.5, 2.0]\n"))
     right = load_level(write(tmp_path, picture, "launch: [3.5, 2.0]\n"))
     assert left.outline.max(axis=0)[0] == pytest.approx(2.9)
     assert right.outline.min(axis=0)[0] == pytest.approx(3.1)
     assert left.launch == (1.5, 2.0)
+
+
+def test_a_closed_room_is_refused_with_a_point_in_it(tmp_path: Path) -> None:
+    picture = plan()
+    picture[10:80, 68:72] = WALL  # 2.9 m and 1.9 m wide, without a door
+    name = write(tmp_path, picture)
+    with pytest.raises(InputError) as caught:
+        load_level(name)
+    said = re.fullmatch(
+        rf"level {name}: (.*) m² around \((.*), (.*)\) are closed in .* the launch: fill it in, or open the wall",
+        str(caught.value),
+    )
+    assert said is not None, caught.value
+    size, x, y = map(float, said.groups())
+    assert size == pytest.approx(1.9 * 3.5 - 0.25)
+    assert 3.8 < x < 5.3  # well inside, and not in the pillar
+    assert 0.7 < y < 3.8
+    assert not (4.0 <= x <= 4.5 and 2.5 <= y <= 3.0)
+    for launch, side in (("[1.5, 2.0]", r"\(4\."), ("[5.0, 2.0]", r"\(1\.")):
+        with pytest.raises(InputError, match=rf"map\.yaml:1: \d+\.\d+ m² around {side}"):
+            load_level(write(tmp_path, picture, f"origin: [0, 0, 0]\nlaunch: {launch}\n"))
+    picture[40:60, 68:72] = FREE  # the wall opened
+    assert area(load_level(write(tmp_path, picture))) > 14.0
+
+
+def test_a_closed_room_is_told_in_the_frame_of_the_map(tmp_path: Path) -> None:
+    picture = plan()
+    picture[10:80, 68:72] = WALL
+    with pytest.raises(InputError, match=r"map\.yaml:1: .* m² around \(-5\.\d+, -\d\.\d+\)"):
+        load_level(write(tmp_path, picture, "origin: [-10.0, -5.0, 0.0]\nlaunch: [-8.5, -3.0]\n"))
+
+
+@pytest.mark.parametrize(("side", "refused"), [(9, False), (10, True)])
+def test_closed_regions_count_from_a_quarter_of_a_square_metre(tmp_path: Path, side: int, refused: bool) -> None:
+    picture = plan()
+    picture[50:70, 50:70] = WALL
+    picture[54 : 54 + side, 54 : 54 + side] = FREE
+    name = write(tmp_path, picture)
+    if refused:
+        with pytest.raises(InputError, match=r"0\.25 m² around \(2\.9\d, 1\.5\d\) are closed in"):
+            load_level(name)
+    else:
+        assert len(load_level(name).solids) == 2  # the hollow one is solid
+
+
+def test_outdoors_is_left_out_and_a_launch_there_leaves_out_no_room(tmp_path: Path) -> None:
+    picture = plan(160, 130)
+    picture[picture == UNKNOWN] = FREE
+    assert area(load_level(write(tmp_path, picture))) == pytest.approx(5.0 * 3.5 - 0.25, rel=0.03)
+    with pytest.raises(InputError, match=r"closed in .* or give another launch"):
+        load_level(write(tmp_path, picture, "launch: [7.0, 1.0]\n"))
 
 
 def test_without_launch_a_room_is_chosen_before_the_outdoors(tmp_path: Path) -> None:
@@ -146,6 +200,8 @@ def test_people_and_crates_may_be_added(tmp_path: Path) -> None:
         ("origin: [900, 0, 0]\n", r":3: origin: a level lies within"),
         ("free_thresh: 0.0\n", r":1: no pixel is free: look at negate"),
         ("title: [1]\n", r":3: title: "),
+        ("title: a\noccupied_thresh: 0.1\n", r":4: occupied_thresh: 0\.1 is below free_thresh, 0\.196: .*raise it"),
+        ("free_thresh: 0.7\n", r":3: occupied_thresh: 0\.65 is below free_thresh, 0\.7: "),
     ],
 )
 def test_wrong_keys_are_told_by_file_and_line(tmp_path: Path, text: str, said: str) -> None:
@@ -167,7 +223,7 @@ def test_wrong_images_are_named(tmp_path: Path) -> None:
             load_level(str(tmp_path / "map.yaml"))
     with pytest.raises(InputError, match=r"give metres a pixel behind it, such as .*map\.png@0\.05"):
         load_level(str(tmp_path / "map.png"))
-    with pytest.raises(InputError, match="are more than 200 m: check the resolution"):
+    with pytest.raises(InputError, match=r"level .*map\.png@5: .* are more than 200 m: check the resolution"):
         load_level(f"{tmp_path / 'map.png'}@5")
     with pytest.raises(InputError, match="metres a pixel, above 0"):
         load_level(f"{tmp_path / 'map.png'}@0")
