@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
 from imagine.core.frames import Pose
-from imagine.core.frontier import FAR, PAD, UNIT_M, FrontierField, cost_at
+from imagine.core.frontier import PAD, UNIT_M, FrontierField, cost_at
+from imagine.core.frontier_paths import FAR
 from imagine.core.lidar import LidarSpec, Scan
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.peer_poses import PeerPoses, fill_peer_distances

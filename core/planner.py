@@ -11,7 +11,8 @@ import numba
 import numpy as np
 
 from imagine.core.frames import Pose
-from imagine.core.frontier import FAR, FREE, OCCUPIED, PAD, PLAN_CELL, UNKNOWN, FrontierField
+from imagine.core.frontier import FREE, OCCUPIED, PAD, PLAN_CELL, UNKNOWN, FrontierField
+from imagine.core.frontier_paths import FAR
 from imagine.core.lidar import LidarSpec, Scan
 
 _LOOKAHEAD_CELLS = 8

@@ -31,8 +31,8 @@ def hear_peers(first, last, positions, ages, explorer_ages, peers, ticks, ticks_
     """Note what drones were told of their peers by `ticks` `[world]`, as `onboard.teammates` does from their nodes.
 
     `positions` float64 `[world, drone, peer, 2]` and `ages` `[world, drone, peer]` as in `PeerPoses`, where a peer
-    that never said where it is has an age of inf; in `explorer_ages` so has one that never said what it does. `peers`
-    are the air's PEER records `[world, drone, peer]`.
+    that never said where it is has an age of inf; in `explorer_ages` so has one that has yet to say that it explores.
+    `peers` are the air's PEER records `[world, drone, peer]`.
     """
     drones = positions.shape[1]
     for world in range(first, last):

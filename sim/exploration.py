@@ -83,8 +83,9 @@ class Exploration:
     ) -> None:
         """Load the levels. Equal settings and seed give equal runs, and `reset` starts the first episodes.
 
-        Without `restart` a finished world stays as it ended until `reset`. All that is random in a world depends on
-        `seed` and its key (default: its index) alone: world k of a batch equals a batch of one with `world_keys=[k]`.
+        Without `restart` a finished world stays as it ended until `reset`, done in every step. All that is random in a
+        world depends on `seed` and its key (default: its index) alone: world k of a batch equals a batch of one with
+        `world_keys=[k]`.
         """
         self.settings = settings
         self._restarts = restart
@@ -108,6 +109,7 @@ class Exploration:
         self.decisions = DecisionState(worlds, drones, rows, columns, settings.observation, settings.action, workers)
         self._recorder = Recorder(worlds, drones, seed)
         self.ticks = np.zeros(worlds, np.int64)
+        self._ended = np.zeros(worlds, bool)  # and not started anew
         self._idle = np.zeros(worlds, np.int64)
         self._limit = np.full(worlds, settings.episode_ticks)
         self._swept = sweep_cells(cap, settings.action.speed_mps, TICK_S)
@@ -158,6 +160,7 @@ class Exploration:
         self.air.clear(world)
         self.decisions.clear(world)
         self.ticks[world] = 0
+        self._ended[world] = False
         self._idle[world] = 0
         self._limit[world] = self.settings.episode_ticks
         if self._drift is not None:
@@ -173,12 +176,13 @@ class Exploration:
         self.decisions.decide(np.asarray(actions, np.float32), self.estimates)
         self._now = 1 - self._now
         reward = np.zeros((self.worlds, self.drones), np.float32)
-        running = np.ones(self.worlds, bool)
+        running = ~self._ended
         ticks = self.settings.action.decision_ticks
         for tick in range(ticks):  # a world that ends waits for the others' decisions to end
             reward += self._tick(running, tick == ticks - 1)
         done = ~running
-        episodes = [self._metrics(int(world)) for world in np.flatnonzero(done)]
+        episodes = [self._metrics(int(world)) for world in np.flatnonzero(done & ~self._ended)]
+        self._ended |= done
         if self._restarts and done.any():
             for world in np.flatnonzero(done):
                 self._restart(int(world))

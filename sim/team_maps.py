@@ -14,15 +14,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.frontier import (
-    BLOCKED,
-    PAD,
-    has_frontier,
-    refresh_kinds,
-    refresh_states,
-    search_scratch,
-    update_costs,
-)
+from imagine.core.frontier import PAD, has_frontier, refresh_kinds, refresh_states
+from imagine.core.frontier_paths import BLOCKED, search_scratch, update_costs
 from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec
 from imagine.core.raster import LIMIT, TILE, apply_marks, beam_directions, mark_scan, ray_table
 from imagine.sim.workers import Workers

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.frontier import FAR, PAD, PLAN_CELL, UNIT_M
+from imagine.core.frontier import PAD, PLAN_CELL, UNIT_M
+from imagine.core.frontier_paths import FAR
 from imagine.core.lidar import LidarSpec
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.raster import CELL, LIMIT

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from imagine.core.frontier import (
-    BLOCKED,
     FREE,
     OCCUPIED,
     PAD,
@@ -24,9 +23,8 @@ from imagine.core.frontier import (
     plan_cell,
     refresh_kinds,
     refresh_states,
-    search_scratch,
-    update_costs,
 )
+from imagine.core.frontier_paths import BLOCKED, search_scratch, update_costs
 from imagine.core.raster import TILE
 
 STRAIGHT_M, DIAGONAL_M, NEAR_WALL = 0.20, 0.28, 3.0

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from imagine.core.frames import Pose
-from imagine.core.frontier import BLOCKED, PAD, FrontierField, frontier_field
+from imagine.core.frontier import PAD, FrontierField, frontier_field
+from imagine.core.frontier_paths import BLOCKED
 from imagine.core.lidar import LD19, LidarSpec, Scan
 from imagine.core.observation import observe
 from imagine.core.observation_spec import ObservationSpec

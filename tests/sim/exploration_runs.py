@@ -22,6 +22,7 @@ from imagine.sim.dynamics import DynamicsSettings
 from imagine.sim.exploration import Exploration, Step
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.lidar_model import LidarModel
+from imagine.sim.odometry_drift import DriftSettings
 from imagine.sim.radio import RadioSettings
 from imagine.sim.reward import RewardSettings
 
@@ -58,6 +59,7 @@ def everything(hall: str, **changes: Any) -> ExplorationSettings:
         "dynamics": DynamicsSettings(
             lag_s=(0.05, 0.4), drag_per_s=(0.0, 0.6), mass_kg=(0.05, 0.5), delay_s=(0.0, 0.3), wind_mps=(0.0, 0.3)
         ),
+        "drift": DriftSettings(enabled=True),
         "sensing": LidarModel(
             noise_per_m=0.002, noise_scale=(0.5, 2.0), dropout=(0.0, 0.1), miss_at_max=0.2, dark_share=0.05, skew=True
         ),
@@ -89,6 +91,7 @@ def state(env: Exploration, step: Step, world: int) -> dict[str, Any]:
     return told | {
         "critic": step.observation.critic[world], "reward": step.reward[world].copy(), "done": step.done[world],
         "ranges": env.ranges[world].copy(), "poses": twin.poses[world].copy(), "velocity": twin.velocity[world].copy(),
+        "estimates": env.estimates[world].copy(),
         "wind": twin.wind[world].copy(), "alive": env.alive[world].copy(), "contacts": twin.contacts[world].copy(),
         "people": discs[discs[:, 2] > 0.0].copy(), "crates": edges[edges.any(axis=1)].copy(),
         "bytes": air.bytes_sent[world].copy(), "heard": air.state.links[world].copy(),

@@ -106,25 +106,17 @@ class TeamOnBoard:
         self._packed: dict[tuple[int, TileKey, int], bytes] = {}
         self._said_until = np.full(env.drones, -1)
         self._nodes = env.air.state.nodes[self.world].copy()
-        self._nodes["next_scan"], self._nodes["scan_clock"] = -np.inf, 0  # as before the launch, when none was sent yet
+        self._nodes["next_scan"], self._nodes["scan_clock"] = -np.inf, 0  # as before the launch
         column, row = (int(number) * CELL for number in env.maps.origins[self.world])
         rows, columns = env.maps.belief.shape[2:]
         for own in self.drones:
             own.evidence.cover(column, row, column + columns * CELL - 0.05, row + rows * CELL - 0.05)
-        self._meet()
-
-    def _meet(self) -> None:
-        """Let those in reach hear what the others had to tell before they explored, as the batch does at a launch."""
-        for own in self.drones:
-            for peer in self.drones:
-                if self.env.air.state.reach[self.world, peer.at[1], own.at[1]]:
-                    x, y, yaw = (float(number) for number in self.env.estimates[peer.at])
-                    status = messages.Status(peer.id, 0.0, Pose(x, y, yaw), (0.0, 0.0), ladder="climb")
-                    own.node.receive(self._sealers[peer.at[1]].seal(messages.encode(status)), 0.0)
 
     def tick(self) -> None:
         """Hear, look and speak as the batch did in the tick that it has just flown."""
         now = int(self.env.ticks[self.world]) / self.rules.ticks_per_s
+        if now == 0.0:
+            self._meet()
         self._hear(now)
         for own in self.drones:
             own.look(now)
@@ -134,6 +126,16 @@ class TeamOnBoard:
         for own in self.drones:
             self._speak(own, now)
         self._nodes = self.env.air.state.nodes[self.world].copy()
+
+    def _meet(self) -> None:
+        """Let those in reach of each other at the launch have told, on their way up, where they are."""
+        for sender in self.drones:
+            x, y, yaw = (float(number) for number in self.env.estimates[sender.at])
+            status = messages.Status(sender.id, 0.0, Pose(x, y, yaw), ladder="climb")
+            datagram = self._sealers[sender.at[1]].seal(messages.encode(status))
+            for own in self.drones:
+                if self.env.air.state.reach[self.world, sender.at[1], own.at[1]]:
+                    own.node.receive(datagram, 0.0)
 
     def _hear(self, now: float) -> None:
         due = sorted(message for message in self._in_flight if message.arrival <= now + 1e-9)

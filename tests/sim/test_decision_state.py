@@ -48,7 +48,8 @@ def roam(env: Exploration, ticks: int, rng: np.random.Generator) -> None:
 
 def test_peers_are_known_by_what_they_said_and_how_long_ago() -> None:
     env = make(EVERYTHING, radio=RadioSettings(range_m=2.0))
-    ages = np.where(env.air.state.reach, 0.0, np.inf)  # at the launch, those in reach know of each other
+    ages = np.where(env.links(), 0.0, np.inf)  # they met at the launch
+    np.testing.assert_array_equal(env.decisions.ages, ages)
     flown = [env.twin.poses[..., :2].copy()]
     rng = np.random.default_rng(1)
     met = parted = 0
@@ -71,7 +72,7 @@ def test_peers_are_known_by_what_they_said_and_how_long_ago() -> None:
     known = np.isfinite(env.decisions.ages)
     assert not known[:, range(DRONES), range(DRONES)].any()
     env.reset()
-    np.testing.assert_array_equal(np.isfinite(env.decisions.ages), env.air.state.reach.astype(bool))
+    np.testing.assert_array_equal(env.decisions.ages, np.where(env.links(), 0.0, np.inf))
 
 
 def test_under_the_protocol_off_nobody_is_known() -> None:

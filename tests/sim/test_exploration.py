@@ -162,8 +162,18 @@ def test_without_restart_a_world_stays_as_it_ended() -> None:
     assert step.done.all()
     assert len(step.episodes) == 1
     assert env.maps.coverage()[0] == pytest.approx(step.episodes[0].coverage)
+    poses, versions = env.twin.poses.copy(), env.maps.versions.copy()
+    for _ in range(3):
+        step = planner_step(env)
+        assert step.done.all()
+        assert not step.episodes
+        assert not step.reward.any()
+    assert env.ticks[0] == 3
+    np.testing.assert_array_equal(env.twin.poses, poses)
+    np.testing.assert_array_equal(env.maps.versions, versions)
     env.reset()
     assert env.ticks[0] == 0
+    assert not planner_step(env).done.any()
 
 
 def test_an_explored_world_ends_early_and_says_when_shares_were_reached() -> None:

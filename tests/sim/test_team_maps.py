@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from imagine.core.evidence import EvidenceMap
 from imagine.core.frames import Pose
-from imagine.core.frontier import BLOCKED, FAR, PAD, frontier_field
+from imagine.core.frontier import PAD, frontier_field
+from imagine.core.frontier_paths import BLOCKED, FAR
 from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec, Scan, mask_near
 from imagine.core.raster import TILE, ray_table
 from imagine.sim.level import load_level

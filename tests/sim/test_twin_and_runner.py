@@ -18,6 +18,7 @@ from imagine.core.raster import TILE
 from imagine.sim.air import DIGEST, SCAN, STATUS, TILES
 from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.exploration_settings import ExplorationSettings
+from imagine.sim.odometry_drift import DriftSettings
 from imagine.sim.radio import RadioSettings
 
 TICKS = 160
@@ -54,22 +55,22 @@ def check(own: OnBoard, env: Exploration, seen: Observation, planned: Any, when:
 
 
 @pytest.mark.parametrize(
-    ("level", "protocol", "axes", "options", "radio"),
+    ("level", "protocol", "axes", "options", "radio", "drifts"),
     [
-        ("4", "off", "map", EVERYTHING, {}),
-        ("5", "one-hop", "heading", EVERYTHING, {}),
-        ("4", "one-hop", "map", EVERYTHING, {"loss": 0.2, "latency_s": 0.15}),
-        ("5", "multi-hop", "map", EVERYTHING, {"range_m": 3.0}),
-        ("4", "multi-hop", "heading", {}, {"loss": 0.1, "model": "path-loss"}),
+        ("4", "off", "map", EVERYTHING, {}, True),
+        ("5", "one-hop", "heading", EVERYTHING, {}, False),
+        ("4", "one-hop", "map", EVERYTHING, {"loss": 0.2, "latency_s": 0.15}, False),
+        ("5", "multi-hop", "map", EVERYTHING, {"range_m": 3.0}, True),
+        ("4", "multi-hop", "heading", {}, {"loss": 0.1, "model": "path-loss"}, False),
     ],
 )
 def test_a_batched_drone_knows_what_a_runner_would_know(
-    level: str, protocol: Any, axes: Any, options: dict[str, Any], radio: dict[str, Any]
+    level: str, protocol: Any, axes: Any, options: dict[str, Any], radio: dict[str, Any], drifts: bool
 ) -> None:
     settings = ExplorationSettings(
         levels=(level,), worlds=2, drones=3, mirror=True, random_launch=level == "4", stop_coverage=1.0,
         observation=ObservationSpec(view_cells=16, axes=axes, **options), action=ActionSpec(mode="body"),
-        protocol=protocol, radio=RadioSettings(**radio),
+        protocol=protocol, radio=RadioSettings(**radio), drift=DriftSettings(enabled=drifts),
     )  # fmt: skip
     env = Exploration(settings, seed=11, restart=False)
     seen = env.reset()
@@ -87,6 +88,7 @@ def test_a_batched_drone_knows_what_a_runner_would_know(
         actions = np.nan_to_num(planned)
         actions[..., 2] = 0.5 * np.sin(tick / 7.0 + np.arange(3))  # they turn as they go
         seen = env.step(actions).observation
+    assert (env.estimates != env.twin.poses).any() == drifts
     assert (sum(team.relayed for team in teams) > 0) == (protocol == "multi-hop")
     for team in teams:
         assert (team.lost > 0) == ("loss" in radio)
