@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
 import torch
 from numpy.typing import NDArray
 
+from imagine.core.errors import InputError
+from imagine.core.lidar import PRESETS, LidarSpec
 from imagine.onboard.policy import OnnxPolicy
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.checkpoint import actor_of, load_checkpoint
@@ -46,7 +50,7 @@ def policy_of(actor: Actor, name: str, env: ExplorationSettings | None = None) -
 def load_policy(path: Path) -> Policy:
     """Load a policy from an ONNX model with its contract, or from a checkpoint (`.pt`, or a run folder).
 
-    Raises InputError when the file is missing, damaged, or without a contract.
+    Raises InputError when the file is missing, damaged, without a contract, or made for a sensor that is no preset's.
     """
     if path.is_dir() or path.suffix == ".pt":
         checkpoint = load_checkpoint(path)
@@ -59,6 +63,15 @@ def load_policy(path: Path) -> Policy:
         return result
 
     env = ExplorationSettings(
-        map=contract.map, limits=contract.limits, observation=contract.observation, action=contract.action
-    )
+        map=contract.map, limits=contract.limits, observation=contract.observation, action=contract.action,
+        **_sensor(contract.lidar.spec(), path),
+    )  # fmt: skip
     return Policy(contract.name, act, env)
+
+
+def _sensor(spec: LidarSpec, path: Path) -> dict[str, Any]:
+    """Return the settings of exploration that give this sensor. Raises InputError where no preset is like it."""
+    for name, preset in PRESETS.items():
+        if dataclasses.replace(preset, beams=spec.beams) == spec:
+            return {"lidar": name, "lidar_beams": None if preset.beams == spec.beams else spec.beams}
+    raise InputError(f"{path}: contract: lidar: no preset of the twin is like this sensor; known: {', '.join(PRESETS)}")

@@ -1,9 +1,13 @@
 import imagine.train  # sets up OpenMP, so it comes before torch  # isort: skip
 
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 
 assert imagine.train
+sys.path.append(str(Path(__file__).resolve().parents[1] / "onboard"))  # whose tiny policies are of use here too
 
 
 @pytest.fixture(autouse=True)
