@@ -220,4 +220,5 @@ def _checked(labels: NDArray[np.int32], launched: int, frame: _Frame, place: Pla
             f"{place('image')}: {areas[closed]:.2f} m² around ({x:.2f}, {y:.2f}) are closed in and cannot be reached "
             f"from the launch: {remedy}"
         )
-    return labels == launched
+    region: NDArray[np.bool_] = labels == launched
+    return region
