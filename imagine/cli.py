@@ -249,13 +249,16 @@ def evaluate(
     seed: Annotated[int, typer.Option(min=0)] = 0,
     film: Annotated[Path | None, typer.Option(metavar="FILE.gif|FILE.mp4", help="film the first episode")] = None,
     json_file: JsonFile = None,
+    overrides: Overrides = None,
 ) -> None:
     """Measure a policy in the batched twin: coverage, time to 90%, contacts, bytes."""
     _needs("torch", "train")
     check_outputs(json_file, film_file=film)
     from imagine.evaluate_command import evaluate_and_show
 
-    evaluate_and_show(policy, levels, drones, _protocol(protocol), episodes, seed, json_file, film)
+    evaluate_and_show(
+        policy, levels, drones, _protocol(protocol), episodes, seed, json_file, film, tuple(overrides or ())
+    )
 
 
 @export_app.command("onnx")

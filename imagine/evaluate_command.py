@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from imagine.core.errors import InputError
@@ -16,6 +19,7 @@ from imagine.outputs import write_json
 from imagine.sim.film import Film
 from imagine.train.atomic_file import write_atomically
 from imagine.train.evaluation import evaluate, named_policy
+from imagine.train.evaluation_env import evaluation_env
 
 _HOUSES = "house:"
 _MOST_LEVELS = 1000
@@ -36,21 +40,23 @@ def evaluate_and_show(
     seed: int,
     json_file: Path | None,
     film_file: Path | None = None,
+    overrides: Sequence[str] = (),
 ) -> None:
     """Measure a policy (empty: the shipped one), print a row per level and team size, film the first episode.
 
+    `overrides` change the environment, see `evaluation_env`.
     Raises WorkError where the film cannot be written in the end; see `outputs.check_outputs` for before.
     """
     chosen_levels, sizes = level_list(levels), team_sizes(drones)
     chosen = named_policy(policy or str(DEFAULT_POLICY))
+    env = evaluation_env(chosen, overrides)
     film = None if film_file is None else Film()
-    announce_compiling(_say)
     rows = evaluate(
         chosen, chosen_levels, sizes, protocol, episodes, seed,
-        progress=_say, film=film,
+        env, _tell, film,
     )  # fmt: skip
-    title = f"{policy or 'shipped policy'}, {protocol}, {episodes} episodes each"
-    table = Table(title=title, box=None, padding=(0, 1, 0, 0))  # so that it fits into 80 columns
+    title = ", ".join([policy or "shipped policy", protocol, f"{episodes} episodes each", *overrides])
+    table = Table(title=escape(title), box=None, padding=(0, 1, 0, 0))  # so that it fits into 80 columns
     for heading in _SHOWN.values():
         table.add_column(heading, justify="right")
     for row in rows:
@@ -61,6 +67,16 @@ def evaluate_and_show(
         encoded = film.encode(film_file.suffix)
         write_atomically(film_file, lambda temporary: temporary.write_bytes(encoded))
         print(f"{film_file}: {len(film)} pictures, {len(encoded) / 1e6:.2f} MB", file=sys.stderr)
+
+
+def _tell(text: str) -> None:
+    _announce()  # not before: a wrong level is refused in one line
+    _say(text)
+
+
+@functools.cache
+def _announce() -> None:
+    announce_compiling(_say)
 
 
 def _say(text: str) -> None:
@@ -77,10 +93,12 @@ def _cell(value: object) -> str:
 def level_list(text: str) -> list[str]:
     """Return the levels of a list such as 4, 0-6 or 1,3,house.yaml; house:0-9 and house:0-9:120 are ten houses each.
 
-    Raises InputError on an empty range.
+    Raises InputError on an empty range, and where a name is missing.
     """
     levels: list[str] = []
     for part in (part.strip() for part in text.split(",")):
+        if not part:
+            raise InputError(f"--levels {text!r}: a level is missing: give such as 4, 0-6 or 1,3,house.yaml")
         prefix, seeds, area = "", part, ""
         if part.startswith(_HOUSES):
             prefix, (seeds, colon, size) = _HOUSES, part.removeprefix(_HOUSES).partition(":")

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from imagine.core.errors import InputError
 from imagine.core.lidar import TEAMMATE_RADIUS_M
 from imagine.core.raster import TILE
+from imagine.sim.action_values import action_values
 from imagine.sim.air import Air
 from imagine.sim.air_receive import claim_own
 from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
@@ -86,7 +87,7 @@ class Exploration:
 
         Without `restart` a finished world stays as it ended until `reset`, done in every step. All that is random in a
         world depends on `seed` and its key (default: its index) alone: world k of a batch equals a batch of one with
-        `world_keys=[k]`.
+        `world_keys=[k]`. Raises InputError where a level is wrong, and on a negative seed or key.
         """
         self.settings = settings
         self._restarts = restart
@@ -94,6 +95,7 @@ class Exploration:
         self.worlds, self.drones, self.seed = worlds, drones, seed
         self.lidar = settings.lidar_spec
         keys = list(range(worlds)) if world_keys is None else list(world_keys)
+        _check_seeds(seed, keys, worlds)
         self._variants = [_variants(load_level(name), settings.mirror) for name in settings.levels]
         self._weights = _weights(settings)
         self._generators = [np.random.default_rng([seed, key]) for key in keys]
@@ -169,13 +171,14 @@ class Exploration:
             self._drift.reset(world, self._generators[world])
         self._recorder.begin(world, self.twin.poses[world])
 
-    def step(self, actions: NDArray[np.float32]) -> Step:
+    def step(self, actions: ArrayLike) -> Step:
         """Fly one decision (`ActionSpec.decision_ticks` ticks) with actions `[worlds, drones, action size]` in [-1, 1].
 
-        Raises InputError naming level, drone and place where an action is not finite.
+        Raises InputError where they are not such numbers, naming level, drone and place where one is not finite.
         """
-        self._check(actions)
-        self.decisions.decide(np.asarray(actions, np.float32), self.estimates)
+        wanted = action_values(actions, "actions")
+        self._check(wanted)
+        self.decisions.decide(wanted, self.estimates)
         self._now = 1 - self._now
         reward = np.zeros((self.worlds, self.drones), np.float32)
         running = ~self._ended
@@ -369,6 +372,13 @@ def _variants(level: Level, mirror: bool) -> list[Level]:
         return [level]
     flags = (False, True)
     return [mirrored(level, swap, x, y) for swap in flags for x in flags for y in flags]
+
+
+def _check_seeds(seed: int, keys: Sequence[int], worlds: int) -> None:
+    if seed < 0:
+        raise InputError(f"seed is {seed}: give 0 or more")
+    if len(keys) != worlds or min(keys) < 0:
+        raise InputError(f"world_keys {keys}: give one for each of the {worlds} worlds, none negative")
 
 
 def _weights(settings: ExplorationSettings) -> NDArray[np.float64]:

@@ -41,6 +41,9 @@ class ExplorationSettings(Settings):
     observation: ObservationSpec = ObservationSpec()
     action: ActionSpec = ActionSpec()
     protocol: Protocol = "one-hop"
+    budget_bytes_per_s: float = Field(
+        default=MeshSettings().rate_bytes_per_s, gt=0.0, description="bytes a second that a drone may send, sealed"
+    )
     radio: RadioSettings = RadioSettings()
     reward: RewardSettings = RewardSettings()
     dynamics: DynamicsSettings = DynamicsSettings()
@@ -63,4 +66,4 @@ class ExplorationSettings(Settings):
     @property
     def mesh(self) -> MeshSettings:
         """How the drones use their radios."""
-        return MeshSettings(protocol=self.protocol)
+        return MeshSettings(protocol=self.protocol, rate_bytes_per_s=self.budget_bytes_per_s)

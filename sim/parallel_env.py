@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
+from imagine.sim.action_values import action_values
 from imagine.sim.exploration import CRITIC_CELLS, CRITIC_CHANNELS, Exploration, Observation
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.render import render_world
@@ -89,7 +90,10 @@ class ExplorationEnv(ParallelEnv):  # type: ignore[misc]  # PettingZoo carries n
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, PolicyObservation], dict[str, dict[str, Any]]]:
-        """Start the next episode; with a seed, the first one of that seed. `options` are not used."""
+        """Start the next episode; with a seed, the first one of that seed. `options` are not used.
+
+        Raises InputError on a negative seed, and the running episode goes on.
+        """
         if seed is not None:
             self._exploration = Exploration(self.settings, seed, restart=False)
         self.agents = list(self.possible_agents)
@@ -132,9 +136,10 @@ class ExplorationEnv(ParallelEnv):  # type: ignore[misc]  # PettingZoo carries n
         for agent in self.agents:
             if agent not in actions:
                 raise InputError(f"no action for {agent}")
-            if np.shape(actions[agent]) != wanted.shape[2:]:
-                raise InputError(f"the action of {agent} is {np.shape(actions[agent])}, expected {wanted.shape[2:]}")
-            wanted[0, self._drone(agent)] = actions[agent]
+            action = action_values(actions[agent], f"the action of {agent}")
+            if action.shape != wanted.shape[2:]:
+                raise InputError(f"the action of {agent} is {action.shape}, expected {wanted.shape[2:]}")
+            wanted[0, self._drone(agent)] = action
         return wanted
 
     def state(self) -> NDArray[np.float32]:

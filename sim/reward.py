@@ -11,20 +11,28 @@ from pydantic import Field
 from imagine.core.config import Settings
 from imagine.core.raster import CELL
 
+_MOST = 1e6  # of a weight: rewards are float32, and larger ones would round away the area's small shares
+
 
 class RewardSettings(Settings):
     """Weights of the reward's terms; by default new area alone counts."""
 
-    area_weight: float = Field(default=5.0, ge=0.0, description="of the newly seen area, as `normalise` measures it")
+    area_weight: float = Field(
+        default=5.0, ge=0.0, le=_MOST, description="of the newly seen area, as `normalise` measures it"
+    )
     normalise: Literal["level", "sweep"] = Field(
         default="level",
         description="area as a share of the level's, or of what the sensor sweeps in a step at full speed",
     )
     own_credit: float = Field(default=0.5, ge=0.0, le=1.0, description="share for own discoveries, rest: the team's")
-    collision_penalty: float = Field(default=0.0, ge=0.0, description="for each contact begun, of whatever kind")
+    collision_penalty: float = Field(
+        default=0.0, ge=0.0, le=_MOST, description="for each contact begun, of whatever kind"
+    )
     kill_on_collision: bool = Field(default=False, description="a drone that touches anything is out of the episode")
-    step_cost: float = Field(default=0.0, ge=0.0, description="for each step of a living drone")
-    completion_bonus: float = Field(default=0.0, ge=0.0, description="for each living drone when the level is covered")
+    step_cost: float = Field(default=0.0, ge=0.0, le=_MOST, description="for each step of a living drone")
+    completion_bonus: float = Field(
+        default=0.0, ge=0.0, le=_MOST, description="for each living drone when the level is covered"
+    )
 
 
 def sweep_cells(range_m: float, speed_mps: float, step_s: float) -> float:

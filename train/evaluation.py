@@ -14,7 +14,9 @@ from imagine.mesh_comm.settings import Protocol
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.film import Film
+from imagine.sim.level import load_level
 from imagine.sim.metrics import BYTE_KINDS, CONTACT_KINDS, EpisodeMetrics
+from imagine.train.evaluation_env import evaluation_env
 from imagine.train.policies import Policy, load_policy
 
 MAX_WORLDS = 16
@@ -48,9 +50,12 @@ def evaluate(
 
     Drones start at the level's launch point in the level as it is drawn. `env` gives what the rows do not (episode
     length, limits, radio); by default what the policy was made for. The deterministic policy flies. `progress` is told
-    what comes next; `film` takes the first episode of the first row.
+    what comes next; `film` takes the first episode of the first row. Raises InputError where any level is wrong, or too
+    small for the largest team, before anything is flown.
     """
-    base = env or (policy.env if isinstance(policy, Policy) else None) or ExplorationSettings()
+    base = env or evaluation_env(policy)
+    for level in levels:
+        load_level(level).launch_poses(max(drones), None)
     rows: list[dict[str, Any]] = []
     for level in levels:
         for count in drones:

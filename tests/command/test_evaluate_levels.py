@@ -33,6 +33,8 @@ def test_lists_and_ranges(text: str, levels: list[str]) -> None:
         ("6-0", "--levels 6-0: the range is empty; write 0-6"),
         ("1,house:9-3:80", "--levels house:9-3:80: the range is empty; write house:3-9:80"),
         ("house:0-5000", "more than 1000 levels"),
+        ("", "--levels '': a level is missing"),
+        ("1,,2", "--levels '1,,2': a level is missing"),
     ],
 )
 def test_ranges_that_are_none(text: str, said: str) -> None:

@@ -11,6 +11,15 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 
+def unfilled(text: str) -> list[str]:
+    """Return the lines, with their numbers, that hold a slot: a template's braces, or a table cell of "…" alone."""
+    return [
+        f"{number}: {line.strip()}"
+        for number, line in enumerate(text.splitlines(), start=1)
+        if "{{" in line or (line.lstrip().startswith("|") and "…" in [cell.strip(" `*") for cell in line.split("|")])
+    ]
+
+
 @pytest.mark.skipif(not (ROOT / ".git").exists() or shutil.which("git") is None, reason="not a git checkout")
 def test_no_text_holds_a_slot_still_to_be_filled() -> None:
     listed = subprocess.run(
@@ -18,11 +27,16 @@ def test_no_text_holds_a_slot_still_to_be_filled() -> None:
     )
     names = [name for name in listed.stdout.split("\0") if name]
     assert "README.md" in names
-    unfilled = [
-        f"{name}:{number}: {line.strip()}"
+    slots = [
+        f"{name}:{line}"
         for name in names
         if (ROOT / name).exists()
-        for number, line in enumerate((ROOT / name).read_text(encoding="utf-8").splitlines(), start=1)
-        if "{{" in line
+        for line in unfilled((ROOT / name).read_text(encoding="utf-8"))
     ]
-    assert unfilled == []
+    assert slots == []
+
+
+def test_a_slot_is_a_template_or_a_cell_of_an_ellipsis_alone() -> None:
+    assert unfilled("fine\n| level | … |\n") == ["2: | level | … |"]
+    assert unfilled("as {{ figure }} says") == ["1: as {{ figure }} says"]
+    assert unfilled("| `env.…` | and so on … |\n… | goes on") == []

@@ -16,6 +16,7 @@ from imagine.core.errors import InputError
 from imagine.core.lidar import Scan
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.shield import shield_velocity
+from imagine.mesh_comm.settings import MeshSettings
 from imagine.sim.coverage import Coverage
 from imagine.sim.exploration import Exploration, Step
 from imagine.sim.exploration_settings import ExplorationSettings
@@ -278,6 +279,12 @@ def test_wrong_actions_and_settings_are_refused_by_name() -> None:
     for wrong in (np.nan, np.inf, -np.inf):
         with pytest.raises(InputError, match=where):
             env.step(np.array([[[0, 0], [0, wrong]]], np.float32))
+    with pytest.raises(InputError, match="is not finite"):
+        env.step(np.array([[[0, 0], [0, 1e39]]]))  # more than float32 holds
+    with pytest.raises(InputError, match="actions: not numbers but str"):
+        env.step([[["1", "0"], ["0", "0"]]])
+    with pytest.raises(InputError, match="actions: lists of unequal lengths"):
+        env.step([[[0.0, 0.0], [0.0]]])
     assert env.ticks[0] == 0  # nothing was flown
     with pytest.raises(InputError, match="level_weights"):
         Exploration(settings(level_weights=(1.0, 2.0)), seed=0)
@@ -287,6 +294,36 @@ def test_wrong_actions_and_settings_are_refused_by_name() -> None:
         settings(lidar="none")
     with pytest.raises(ValueError, match="drones"):
         settings(drones=17)
+
+
+def test_negative_seeds_and_world_keys_are_refused_by_name() -> None:
+    with pytest.raises(InputError, match="seed is -7"):
+        Exploration(settings(), seed=-7)
+    for keys in ([-1], [0, 1]):
+        with pytest.raises(InputError, match=r"world_keys .*: give one for each of the 1 worlds, none negative"):
+            Exploration(settings(), seed=0, world_keys=keys)
+
+
+def test_actions_may_be_nested_lists() -> None:
+    listed, given = Exploration(settings(), seed=0), Exploration(settings(), seed=0)
+    listed.reset(), given.reset()
+    for _ in range(5):
+        listed.step([[[1, 0.5], [0, -1]]])
+        given.step(np.array([[[1, 0.5], [0, -1]]], np.float32))
+    assert np.hypot(*given.twin.velocity[0, 0, :2]) > 0.1
+    np.testing.assert_array_equal(listed.twin.poses, given.twin.poses)
+
+
+def test_a_smaller_budget_sends_fewer_bytes() -> None:
+    sent = []
+    for budget in (MeshSettings().rate_bytes_per_s, 1000.0):
+        env = Exploration(settings(levels=("1",), budget_bytes_per_s=budget), seed=0)
+        env.reset()
+        for _ in range(150):
+            env.step(np.nan_to_num(env.planner_actions()))
+        sent.append(env.air.bytes_sent[0].sum(axis=-1))
+    assert (sent[1] < 0.8 * sent[0]).all()
+    assert (sent[1] <= 1000.0 * 15.1 + MeshSettings().burst_bytes).all()
 
 
 def test_more_drones_than_a_level_has_room_for_are_refused(tmp_path: Path) -> None:

@@ -257,6 +257,8 @@ def test_wrong_actions_are_refused_by_name() -> None:
         env.step({"drone_1": fine})
     with pytest.raises(InputError, match=r"drone_2 is \(3,\)"):
         env.step({"drone_1": fine, "drone_2": np.zeros(3, np.float32)})
+    with pytest.raises(InputError, match="the action of drone_2: not numbers"):
+        env.step({"drone_1": fine, "drone_2": ["left", "right"]})  # type: ignore[dict-item]
     with pytest.raises(InputError, match="not finite"):
         env.step({"drone_1": fine, "drone_2": np.full(2, np.nan, np.float32)})
 
@@ -266,3 +268,12 @@ def test_without_pettingzoo_the_message_tells_the_extra(monkeypatch: pytest.Monk
     monkeypatch.delitem(sys.modules, "imagine.sim.parallel_env")
     with pytest.raises(InputError, match=r"imagine-swarm\[train\]"):
         importlib.import_module("imagine.sim.parallel_env")
+
+
+def test_a_negative_seed_is_refused_and_the_episode_goes_on() -> None:
+    env = ExplorationEnv(SMALL)
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="seed is -7"):
+        env.reset(seed=-7)
+    _, _, _, _, infos = env.step(dict.fromkeys(env.agents, np.zeros(2, np.float32)))
+    assert infos["drone_1"]["ticks"] == 1

@@ -77,3 +77,10 @@ def test_who_touches_anything_dies_with_its_penalty_and_stays_dead() -> None:
     assert rewards(GAINED, CONTACTS, after, COVERABLE, settings, 64.0)[0, 1] == 0.0
     assert survivors(after, NO_CONTACTS, settings).tolist() == after.tolist()
     assert survivors(ALIVE, CONTACTS, RewardSettings()).all()  # by default a contact kills nobody
+
+
+@pytest.mark.parametrize("weight", ["area_weight", "collision_penalty", "step_cost", "completion_bonus"])
+def test_weights_beyond_a_million_are_refused(weight: str) -> None:
+    assert getattr(RewardSettings(**{weight: 1e6}), weight) == 1e6
+    with pytest.raises(ValueError, match=weight):
+        RewardSettings(**{weight: 1.1e6})

@@ -12,6 +12,7 @@ from imagine.sim.metrics import BYTE_KINDS, EpisodeMetrics
 from imagine.sim.radio import RadioSettings
 from imagine.sim.twin import TICK_S
 from imagine.train.evaluation import bootstrap_interval, evaluate, named_policy, row, run_episodes
+from imagine.train.evaluation_env import evaluation_env
 from imagine.train.networks import Actor, NetworkSettings
 from imagine.train.policies import policy_of
 
@@ -145,3 +146,53 @@ def test_an_unknown_policy_or_level_is_named():
         named_policy("nowhere.onnx")
     with pytest.raises(InputError, match="77"):
         evaluate("random", ["77"], episodes=1)
+
+
+def test_all_levels_are_loaded_before_any_is_flown(tmp_path):
+    closet = tmp_path / "closet.yaml"
+    closet.write_text("{size_m: [2, 2], launch: [1, 1]}")
+    for wrong, said in (("77", "unknown level '77'"), (str(closet), "room for")):
+        told = []
+        with pytest.raises(InputError, match=said):
+            evaluate("random", ["0", wrong], drones=(1, 16), episodes=1, env=SHORT, progress=told.append)
+        assert told == []
+
+
+def test_overrides_are_laid_over_what_the_policy_was_made_for():
+    made_for = SHORT.model_copy(update={"episode_ticks": 70})
+    policy = policy_of(Actor(NetworkSettings(), SHORT.observation, 2), "mine", made_for)
+    changed = evaluation_env(policy, ["env.dynamics.wind_mps=0.5", "env.budget_bytes_per_s=2000"])
+    assert changed.dynamics.wind_mps == 0.5
+    assert changed.mesh.rate_bytes_per_s == 2000.0
+    assert changed.observation == SHORT.observation
+    assert changed.episode_ticks == 70
+    assert evaluation_env(policy) == made_for
+    assert evaluation_env("frontier", ["env.episode_ticks=9"]) == ExplorationSettings(episode_ticks=9)
+
+
+def test_an_override_changes_what_is_flown():
+    calm, windy = (
+        evaluate(
+            "random", ["1"], drones=(2,), episodes=1, env=evaluation_env("random", ["env.episode_ticks=60", *more])
+        )
+        for more in ([], ["env.dynamics.wind_mps=0.5"])
+    )
+    assert calm[0]["path_m"] != windy[0]["path_m"]
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("env.dynamics.wind_mp=1", r"unknown key 'env\.dynamics\.wind_mp'; did you mean 'wind_mps'"),
+        ("wind_mps=1", "unknown key 'wind_mps'; valid keys: env"),
+        ("env.drones=2", "sets drones itself: give --drones"),
+        ("env.mirror=true", "sets mirror itself"),
+        ("env.observation.view_cells=24", r"env\.observation: mine was made for another"),
+        ("env.action.mode=body", r"env\.action: mine was made for another"),
+        ("env", "key=value"),
+    ],
+)
+def test_overrides_that_cannot_be_are_refused(override, said):
+    policy = policy_of(Actor(NetworkSettings(), SHORT.observation, 2), "mine", SHORT)
+    with pytest.raises(InputError, match=said):
+        evaluation_env(policy, [override])
