@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from imagine.core.errors import InputError
@@ -90,6 +90,7 @@ def test_the_area_is_the_one_asked_for(seed: int, area: float) -> None:
 
 
 @given(st.integers(0, 2**32))
+@example(10252)  # a corridor as narrow as any
 @settings(max_examples=60)
 def test_rooms_fill_the_outline_and_doors_lie_in_their_walls(seed: int) -> None:
     dice = Dice(np.random.Generator(np.random.PCG64(seed)))
@@ -99,7 +100,7 @@ def test_rooms_fill_the_outline_and_doors_lie_in_their_walls(seed: int) -> None:
     rects = [room.rect for room in layout.rooms]
     assert sum(rect.area for rect in rects) == pytest.approx(signed_area(np.array(layout.outline)), rel=1e-6)
     assert not any(a.overlaps(b) for a, b in itertools.combinations(rects, 2))
-    assert min(min(rect.width, rect.depth) for rect in rects) >= 1.2
+    assert min(min(rect.width, rect.depth) for rect in rects) >= 1.2 - 1e-9  # coordinates are rounded
     for door in layout.doors:
         assert door.high - door.low >= 0.8 - 1e-9
         for k in door.rooms:
