@@ -266,7 +266,12 @@ class Exploration:
                 )  # fmt: skip
                 lap("observe")
 
-        twin.workers.over(self.worlds, run_part, scratch=self.maps.scratch)
+        busy = np.flatnonzero(modes != WAITING)
+        if 8 * len(busy) <= self.worlds:  # launches of a few worlds are done before threads would have begun
+            for world in busy.tolist():
+                run_part(world, world + 1, self.maps.scratch[0])
+        else:
+            twin.workers.over(self.worlds, run_part, scratch=self.maps.scratch)
         twin.ticks += 1
         active = modes != WAITING
         self.decisions.sense(self.estimates, self.air, self.ticks, self.maps.origins, self.alive, active)
