@@ -91,5 +91,8 @@ def _finish(axes: Axes, x_label: str, y_label: str) -> None:
     axes.grid(True, which="major", color="#e6e6e6", lw=0.8)
     axes.set_axisbelow(True)
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value >= 1.0 else f"{value:g}")
+    low, high = axes.get_ylim()
+    if high < 100.0 * low:  # where minor ticks are told at all, in the same plain numbers
+        axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "235" else "")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8.5, loc="upper left")
