@@ -80,12 +80,3 @@ def find_spans(marks, spans):  # type: ignore[no-untyped-def]
                     first = i
                 last = i + 1
         spans[block, 0], spans[block, 1] = first, last
-
-
-@numba.njit(cache=True, nogil=True)
-def erase(marks):  # type: ignore[no-untyped-def]
-    """Set all marks to zero."""
-    words = marks.view(np.uint64)
-    for i in range(words.shape[0]):
-        for k in range(words.shape[1]):
-            words[np.uintp(i), np.uintp(k)] = 0
