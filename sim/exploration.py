@@ -266,7 +266,7 @@ class Exploration:
                 )  # fmt: skip
                 lap("observe")
 
-        busy = np.flatnonzero(modes != WAITING)
+        busy = np.flatnonzero((modes != WAITING) | (shown != WAITING))
         if 8 * len(busy) <= self.worlds:  # launches of a few worlds are done before threads would have begun
             for world in busy.tolist():
                 run_part(world, world + 1, self.maps.scratch[0])

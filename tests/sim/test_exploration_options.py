@@ -74,6 +74,20 @@ def test_a_world_that_ends_within_a_decision_is_seen_as_it_ended_and_the_other_f
         np.testing.assert_array_equal(array[1], part.observation.policy[name][1])
 
 
+def test_ended_worlds_are_seen_as_they_ended_while_the_last_one_flies_on() -> None:
+    env = make(worlds=16, restart=False, episode_ticks=100, stagger=True, stop_coverage=1.0)
+    env.reset()
+    rng = np.random.default_rng(0)
+    for tick in range(1, 99):
+        step = env.step(rng.uniform(-1.0, 1.0, (16, 3, 2)).astype(np.float32))
+        if tick == 94:  # the last but one ends, and two of sixteen worlds were left to fly
+            ended = {name: array[14].copy() for name, array in step.observation.policy.items()}
+        if tick >= 94:
+            for name, array in step.observation.policy.items():
+                np.testing.assert_array_equal(array[14], ended[name])
+    assert step.done.tolist() == [True] * 15 + [False]
+
+
 def test_observations_last_until_the_step_after_the_next() -> None:
     env = make()
     first = env.reset().policy["views"]
