@@ -1,0 +1,50 @@
+"""Who may fly a batch of worlds: planners, policies and chance, all by the same three calls."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine.sim.exploration import Exploration, Observation
+
+Actions = NDArray[np.float32]
+
+
+class Pilot(Protocol):
+    """Decides for all drones of a batch of worlds, each drone by what it knows itself (but for centralised policies).
+
+    A pilot may keep state from one decision to the next (goals, recurrent state); `begin` and `forget` clear it.
+    """
+
+    name: str
+
+    def begin(self, env: Exploration) -> None:
+        """Get ready for `env`, whose worlds are all at their launch."""
+
+    def forget(self, worlds: NDArray[np.bool_]) -> None:
+        """Drop what is kept of these worlds (bool `[worlds]`), which have started new episodes."""
+
+    def act(self, env: Exploration, observation: Observation) -> Actions:
+        """Return the actions, float32 `[worlds, drones, action size]` in [-1, 1]; nan where a planner has no advice."""
+
+
+class RandomPilot:
+    """Draws every action uniformly from [-1, 1]."""
+
+    name = "random"
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+
+    def begin(self, env: Exploration) -> None:
+        """Keep nothing."""
+
+    def forget(self, worlds: NDArray[np.bool_]) -> None:
+        """Keep nothing."""
+
+    def act(self, env: Exploration, observation: Observation) -> Actions:
+        """Return a draw."""
+        shape: tuple[Any, ...] = (env.worlds, env.drones, env.settings.action.size)
+        return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
