@@ -14,7 +14,7 @@ from imagine.core.frontier import PAD, UNIT_M, FrontierField, cost_at
 from imagine.core.frontier_paths import FAR
 from imagine.core.lidar import LidarSpec, Scan
 from imagine.core.observation_spec import ObservationSpec
-from imagine.core.peer_poses import PeerPoses, fill_peer_distances
+from imagine.core.peer_poses import PeerPoses, fill_peer_distances, fill_peer_places
 from imagine.core.raster import CELL, LIMIT
 from imagine.core.visits import VisitMap, fill_visits, visit_levels
 
@@ -236,7 +236,7 @@ def fill_options(numbers, x, y, yaw, positions, ages, options):  # type: ignore[
 
     `positions` and `ages` of the peers as in `PeerPoses`.
     """
-    position, extent, heading, peers, range_m = options
+    position, extent, heading, peers, range_m, places, places_range_m, memory_s, heading_axes = options
     at = 0
     if position:
         numbers[0] = min(max(x / extent, -2.0), 2.0)
@@ -247,11 +247,18 @@ def fill_options(numbers, x, y, yaw, positions, ages, options):  # type: ignore[
         at += 2
     if peers > 0:
         fill_peer_distances(numbers[at : at + peers], x, y, positions, ages, range_m)
+        at += peers
+    if places > 0:
+        turn = yaw if heading_axes else 0.0
+        fill_peer_places(numbers[at : at + 3 * places], x, y, turn, positions, ages, places_range_m, memory_s)
 
 
-def option_parameters(spec: ObservationSpec) -> tuple[bool, float, bool, int, float]:
+def option_parameters(spec: ObservationSpec) -> tuple[bool, float, bool, int, float, int, float, float, bool]:
     """Return what `fill_options` needs to know of a specification, as plain numbers."""
-    return spec.position, spec.position_extent_m, spec.heading, spec.peers, spec.peers_range_m
+    return (
+        spec.position, spec.position_extent_m, spec.heading, spec.peers, spec.peers_range_m,
+        spec.peer_places, spec.peer_places_range_m, spec.peer_memory_s, spec.axes == "heading",
+    )  # fmt: skip
 
 
 def observe(

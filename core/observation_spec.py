@@ -9,7 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from imagine.core.config import Settings
 from imagine.core.raster import CELL
 
-_OPTIONS = ("position", "heading", "peers", "visits")
+_OPTIONS = ("position", "heading", "peers", "peer_places", "visits")
 
 
 class ObservationSpec(Settings):
@@ -21,7 +21,8 @@ class ObservationSpec(Settings):
 
     Options, all off by default, make it version 2. `visits` appends view channels, one a scale (`self`) or two
     (`team`: self, peers). To `motion` are appended, in this order: `position`, x and y in the map, along the map's axes
-    whatever `axes` says; `heading`, cosine and sine of the yaw in the map; `peers`, that many distances, nearest first.
+    whatever `axes` says; `heading`, cosine and sine of the yaw in the map; `peers`, that many distances, nearest first;
+    `peer_places`, for that many peers, nearest first, two offsets along `axes` and how fresh the report is.
     """
 
     version: Literal[1, 2] = Field(default=1, description="2 where an option is on; may be left out")
@@ -42,6 +43,9 @@ class ObservationSpec(Settings):
     )
     peers: int = Field(default=0, ge=0, le=15, description="so many distances to the nearest known peers are seen")
     peers_range_m: float = Field(default=10.0, gt=0.0, description="distance to a peer that reads as 1, metres")
+    peer_places: int = Field(default=0, ge=0, le=15, description="so many nearest peers are seen where they were heard")
+    peer_places_range_m: float = Field(default=10.0, gt=0.0, description="offset to a peer that reads as 1, metres")
+    peer_memory_s: float = Field(default=20.0, gt=0.0, description="reports older than this are forgotten")
     visits: Literal["off", "self", "team"] = Field(
         default="off", description="see how long this drone, or it and its peers, have been where"
     )
@@ -88,5 +92,5 @@ class ObservationSpec(Settings):
         return {
             "views": ((2 + self.visit_channels) * len(self.view_scales_m), self.view_cells, self.view_cells),
             "lidar": (self.lidar_sectors,),
-            "motion": (3 + 2 * self.position + 2 * self.heading + self.peers,),
+            "motion": (3 + 2 * self.position + 2 * self.heading + self.peers + 3 * self.peer_places,),
         }

@@ -78,7 +78,7 @@ class DecisionState:
         Call it once after the air has delivered what arrives in the tick, and once at a launch. Nobody is known under
         the protocol `off`, as on board.
         """
-        if self._spec.peers == 0 and not self._sees_team and self._spec.visits == "off":
+        if self._spec.peers == self._spec.peer_places == 0 and not self._sees_team and self._spec.visits == "off":
             return
         worlds = len(poses)
         if air.rules.shares:

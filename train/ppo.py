@@ -56,6 +56,9 @@ def update(
     With `policy_moves` False only the critic learns. Raises WorkError when a loss or gradient is not finite, before
     it reaches the weights.
     """
+    for optimiser, lr in ((optimisers.actor, settings.actor_lr), (optimisers.critic, settings.critic_lr)):
+        for group in optimiser.param_groups:
+            group["lr"] = lr
     values, last_values = values_of(critic, rollout, settings.minibatch)
     advantages, returns = advantages_and_returns(
         rollout.rewards, values, rollout.dones, last_values, settings.gamma, settings.gae_lambda
