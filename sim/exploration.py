@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,7 @@ from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.exploration_tick import FLYING, LAUNCHING, STAGES, WAITING, Specs, fly, locate, observe, scan, share
 from imagine.sim.keyed_noise import root_keys
 from imagine.sim.level import Level, load_level, mirrored
+from imagine.sim.level_names import expand_levels
 from imagine.sim.metrics import EpisodeMetrics, EpisodeTotals, Recorder
 from imagine.sim.odometry_drift import OdometryDrift
 from imagine.sim.planner_actions import plan_worlds
@@ -96,8 +97,9 @@ class Exploration:
         self.lidar = settings.lidar_spec
         keys = list(range(worlds)) if world_keys is None else list(world_keys)
         _check_seeds(seed, keys, worlds)
-        self._variants = [_variants(load_level(name), settings.mirror) for name in settings.levels]
-        self._weights = _weights(settings)
+        names, shares = expand_levels(settings.levels, settings.level_weights)
+        self._variants = [_variants(load_level(name), settings.mirror) for name in names]
+        self._weights = np.array(shares)
         self._generators = [np.random.default_rng([seed, key]) for key in keys]
         grids = [level.grid for variants in self._variants for level in variants]
         rows, columns = max(g[3] for g in grids), max(g[2] for g in grids)
@@ -384,11 +386,3 @@ def _check_seeds(seed: int, keys: Sequence[int], worlds: int) -> None:
         raise InputError(f"seed is {seed}: give 0 or more")
     if len(keys) != worlds or min(keys) < 0:
         raise InputError(f"world_keys {keys}: give one for each of the {worlds} worlds, none negative")
-
-
-def _weights(settings: ExplorationSettings) -> NDArray[np.float64]:
-    given: Iterable[float] = settings.level_weights or (1.0,) * len(settings.levels)
-    weights = np.array(list(given), float)
-    if len(weights) != len(settings.levels) or (weights < 0).any() or weights.sum() <= 0:
-        raise InputError("level_weights: give one weight for each of levels, none negative, not all zero")
-    return np.asarray(weights / weights.sum())
