@@ -9,10 +9,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from imagine.core.errors import InputError
 from imagine.sim.generator import AREA_M2, PREFIX
+from imagine.sim.level_variants import level_shares
 from imagine.sim.map_image import IMAGE_SUFFIXES
 
 MOST_LEVELS = 1000
@@ -73,16 +72,12 @@ def expand_levels(
     There is one weight for each of `names` (None: all alike), and what a range stands for shares its weight equally.
     Raises InputError where a name is wrong, or weights do not fit.
     """
-    given = (1.0,) * len(names) if weights is None else tuple(weights)
-    if len(given) != len(names) or any(weight < 0.0 for weight in given) or not np.sum(given) > 0.0:
-        raise InputError("level_weights: give one weight for each of levels, none negative, not all zero")
-    total = float(np.sum(given))
     expanded: list[str] = []
     shares: list[float] = []
-    for name, weight in zip(names, given, strict=True):
+    for name, share in zip(names, level_shares(weights, len(names)).tolist(), strict=True):
         levels = expand_level(name, where)
         expanded += levels
-        shares += [weight / total / len(levels)] * len(levels)
+        shares += [share / len(levels)] * len(levels)
     return tuple(expanded), tuple(shares)
 
 
