@@ -7,7 +7,13 @@ from torch import Tensor
 
 
 def advantages_and_returns(
-    rewards: Tensor, values: Tensor, dones: Tensor, last_values: Tensor, gamma: float, lam: float
+    rewards: Tensor,
+    values: Tensor,
+    dones: Tensor,
+    last_values: Tensor,
+    gamma: float,
+    lam: float,
+    truncated: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return (advantages, returns), both `[steps, agents]`, of a rollout.
 
@@ -15,14 +21,19 @@ def advantages_and_returns(
     after it counts. A drone that dies is done then; its steps until the world's end, which follow that `done` and end
     with another, reach no other step and are to be left out. `last_values` `[agents]` are the values of the state
     after the last step.
+
+    `truncated` `[steps, agents]` tells which episodes the clock ended: a drone cannot see the clock, so what it would
+    still have earned counts (Pardo et al. 2018). The state after such a step was never looked at; it is valued as the
+    state before it, a tick away.
     """
     advantages = torch.empty_like(rewards)
     following = torch.zeros_like(last_values)
     next_values = last_values
+    goes_on = 1.0 - dones.to(rewards.dtype)
+    cut = torch.zeros_like(rewards) if truncated is None else (truncated & dones).to(rewards.dtype)
     for t in range(rewards.shape[0] - 1, -1, -1):
-        goes_on = 1.0 - dones[t].to(rewards.dtype)
-        surprise = rewards[t] + gamma * next_values * goes_on - values[t]
-        following = surprise + gamma * lam * goes_on * following
+        ahead = goes_on[t] * next_values + cut[t] * values[t]
+        following = rewards[t] + gamma * ahead - values[t] + gamma * lam * goes_on[t] * following
         advantages[t] = following
         next_values = values[t]
     return advantages, advantages + values

@@ -14,10 +14,13 @@ from torch import Tensor, nn
 
 from imagine.core.config import Settings
 from imagine.core.observation_spec import ObservationSpec
+from imagine.train.precision import Computing, autocast
 
 CRITIC_CHANNELS = 5
 CRITIC_CELLS = 32
 LOG_STD_RANGE = (-3.0, 0.0)
+RETURN_MEMORY = 0.05  # weight of the newest rollout's returns: 20 rollouts are remembered
+MIN_RETURN_STD = 1e-3  # where no reward was seen yet, noise must not be blown up to be the signal
 
 
 class NetworkSettings(Settings):
@@ -87,7 +90,7 @@ class LidarEncoder(nn.Module):
         return torch.relu(self.linear(self.convolutions(lidar.unsqueeze(1)).flatten(1)))
 
 
-class Actor(nn.Module):
+class Actor(Computing):
     """The policy: a drone's observation to the mean of its action; the spread is one number per action component."""
 
     def __init__(self, settings: NetworkSettings, spec: ObservationSpec, action_size: int) -> None:
@@ -105,8 +108,9 @@ class Actor(nn.Module):
 
     def forward(self, views: Tensor, lidar: Tensor, motion: Tensor) -> Tensor:
         """Return the action's mean, `[batch, action size]` in (-1, 1); this is what flies."""
-        features = torch.cat([self.views(views), self.lidar(lidar), motion], dim=1)
-        return torch.tanh(self.mean(self.trunk(features)))
+        with autocast(self.dtype, views.device):
+            features = self.trunk(torch.cat([self.views(views.to(self.dtype)), self.lidar(lidar), motion], dim=1))
+        return torch.tanh(self.mean(features.float()))
 
     def spread(self) -> Tensor:
         """Return the logarithm of the standard deviation with which training draws actions, `[action size]`."""
@@ -124,7 +128,49 @@ def entropy(log_std: Tensor) -> Tensor:
     return (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
 
 
-class Critic(nn.Module):
+class ReturnScale(nn.Module):
+    """Running mean and deviation of returns, so that a critic learns numbers near 1 whatever rewards and horizon are.
+
+    After van Hasselt et al. 2016 (PopArt). The statistics forget exponentially, a rollout at a time, and without bias
+    toward where they began (Kingma and Ba 2015, section 3). They are saved with the critic's weights.
+    """
+
+    mean: Tensor
+    std: Tensor
+    moments: Tensor
+    weight: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(()))
+        self.register_buffer("std", torch.ones(()))
+        self.register_buffer("moments", torch.zeros(2, dtype=torch.float64))
+        self.register_buffer("weight", torch.zeros((), dtype=torch.float64))
+
+    def normalised(self, returns: Tensor) -> Tensor:
+        """Return returns as the critic learns them."""
+        return (returns - self.mean) / self.std
+
+    def returns(self, normalised: Tensor) -> Tensor:
+        """Undo `normalised`."""
+        return normalised * self.std + self.mean
+
+    @torch.no_grad()
+    def take(self, returns: Tensor, head: nn.Linear) -> None:
+        """Take new returns into the statistics, and change the head so that what it stands for stays the same."""
+        new = torch.stack([returns.double().mean(), returns.double().square().mean()])
+        self.moments.lerp_(new, RETURN_MEMORY)
+        self.weight.lerp_(torch.ones_like(self.weight), RETURN_MEMORY)
+        mean, square = self.moments / self.weight
+        std = (square - mean.square()).clamp(min=MIN_RETURN_STD**2).sqrt().float()
+        mean = mean.float()
+        head.weight.mul_(self.std / std)
+        head.bias.mul_(self.std).add_(self.mean - mean).div_(std)
+        self.mean.copy_(mean)
+        self.std.copy_(std)
+
+
+class Critic(Computing):
     """The value of a drone's state, told from its own observation and from the whole level's truth and coverage."""
 
     def __init__(self, settings: NetworkSettings, spec: ObservationSpec) -> None:
@@ -139,11 +185,26 @@ class Critic(nn.Module):
             _orthogonal(nn.Linear(2 * hidden + hidden // 4 + spec.shapes["motion"][0], hidden)), nn.ReLU()
         )
         self.value = _orthogonal(nn.Linear(hidden, 1), gain=1.0)
+        self.scale = ReturnScale()
 
     def forward(self, views: Tensor, lidar: Tensor, motion: Tensor, level: Tensor) -> Tensor:
-        """Return the values, `[batch]`, of observations and the critic's images of the level `[batch, 5, 32, 32]`."""
-        features = torch.cat([self.views(views), self.level(level), self.lidar(lidar), motion], dim=1)
-        return self.value(self.trunk(features)).squeeze(1)  # type: ignore[no-any-return]
+        """Return normalised values, `[batch]`, of observations and images of the level `[batch, 5, 32, 32]`.
+
+        `scale` turns them into returns and back.
+        """
+        with autocast(self.dtype, views.device):
+            images = self.views(views.to(self.dtype)), self.level(level.to(self.dtype))
+            seen = [*images, self.lidar(lidar), motion]
+            features = self.trunk(torch.cat(seen, dim=1))
+        return self.value(features.float()).squeeze(1)  # type: ignore[no-any-return]
+
+    def values(self, views: Tensor, lidar: Tensor, motion: Tensor, level: Tensor) -> Tensor:
+        """Return the discounted returns that the critic expects, `[batch]`."""
+        return self.scale.returns(self(views, lidar, motion, level))
+
+    def rescale(self, returns: Tensor) -> None:
+        """Take the returns of a rollout into the normalisation; the values that the critic gives stay as they are."""
+        self.scale.take(returns, self.value)  # type: ignore[arg-type]
 
 
 def _orthogonal(layer: nn.Module, gain: float = math.sqrt(2.0)) -> nn.Module:

@@ -10,7 +10,7 @@ from imagine.core.config import Settings, load_settings
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.imitation import ImitationSettings
 from imagine.train.networks import NetworkSettings
-from imagine.train.ppo import PpoSettings
+from imagine.train.ppo_settings import PpoSettings
 
 CONFIGS = Path(__file__).parent / "configs"
 """Folder of the configurations that come with the package: `default.yaml`, `smoke.yaml`."""

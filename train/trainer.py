@@ -102,7 +102,7 @@ class Learner:
         return Learner(
             actor,
             critic,
-            Optimisers(actor, critic, settings.ppo.actor_lr, settings.ppo.critic_lr),
+            Optimisers(actor, critic),
             torch.optim.Adam(actor.parameters(), lr=settings.imitation.lr),
             torch.Generator().manual_seed(settings.run.seed),
             np.random.default_rng(settings.run.seed),
@@ -191,12 +191,14 @@ class Trainer:
         while self.agent_steps["ppo"] < settings.agent_steps and not self._stop.is_set():
             began = time.monotonic()
             rollout, self._observation = collect(
-                self.env, self._observation, learner.actor, settings.rollout_steps, learner.generator
-            )
+                self.env, self._observation, learner.actor, settings.rollout_steps, learner.generator,
+                settings.precision,
+            )  # fmt: skip
             collected = time.monotonic()
             numbers = update(
                 learner.actor, learner.critic, learner.ppo, rollout, settings, learner.generator,
                 policy_moves=self.updates >= settings.critic_warmup_updates,
+                progress=self.agent_steps["ppo"] / settings.agent_steps, number=self.updates,
             )  # fmt: skip
             seconds = {
                 "env": rollout.env_s,

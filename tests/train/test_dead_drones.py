@@ -21,7 +21,7 @@ PPO = PpoSettings(minibatch=32, actor_lr=1e-3, critic_lr=1e-3, kl_stop=None)
 def learners():
     torch.manual_seed(0)
     actor, critic = Actor(SMALL, SPEC, 2), Critic(SMALL, SPEC)
-    return actor, critic, Optimisers(actor, critic, PPO.actor_lr, PPO.critic_lr), torch.Generator().manual_seed(0)
+    return actor, critic, Optimisers(actor, critic), torch.Generator().manual_seed(0)
 
 
 def rollout_with_dead_drones(actor, garbage):

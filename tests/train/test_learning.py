@@ -19,7 +19,7 @@ PPO = PpoSettings(minibatch=64, actor_lr=1e-3, critic_lr=1e-3)
 def learners(seed=0):
     torch.manual_seed(seed)
     actor, critic = Actor(SMALL, SPEC, 2), Critic(SMALL, SPEC)
-    return actor, critic, Optimisers(actor, critic, PPO.actor_lr, PPO.critic_lr), torch.Generator().manual_seed(seed)
+    return actor, critic, Optimisers(actor, critic), torch.Generator().manual_seed(seed)
 
 
 def rollout_that_pays_for_going_east(actor, generator, steps=8, agents=32):
@@ -126,7 +126,8 @@ def test_a_rollout_holds_what_was_seen_done_and_earned():
     assert len(rollout.episodes) >= 2
     assert rollout.rewards.min() >= 0.0
     assert rollout.rewards.sum() > 0.0
-    np.testing.assert_array_equal(rollout.observations["views"][0], seen)
-    np.testing.assert_array_equal(rollout.last["level"], after.critic.reshape(4, 5, 32, 32))
+    np.testing.assert_array_equal(rollout.observations["views"][0], seen.astype(np.float16))
+    np.testing.assert_array_equal(rollout.last["level"], after.critic.reshape(4, 5, 32, 32).astype(np.float16))
+    assert rollout.observations["views"].flatten(0, 1).is_contiguous(memory_format=torch.channels_last)
     mean = actor(*(rollout.observations[key][4] for key in OBSERVATION_KEYS))
     torch.testing.assert_close(rollout.log_probs[4], log_probability(rollout.actions[4], mean, actor.spread()))
