@@ -53,7 +53,7 @@ def update_costs(cost, kinds, dirty, count, is_dirty, scratch):  # type: ignore[
             entry_cell[entries], entry_next[entries], heads[found] = cell, heads[found], entries
             entries += 1
             lowest = min(lowest, found)
-    _settle(costs, flat_kinds, np.uint32(width), lowest, entries, scratch)
+    settle(costs, flat_kinds, np.uint32(width), lowest, entries, scratch)
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -164,7 +164,7 @@ def _onward(level, kinds, step):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _settle(costs, kinds, width, level, queued, scratch):  # type: ignore[no-untyped-def]
+def settle(costs, kinds, width, level, queued, scratch):  # type: ignore[no-untyped-def]
     """Carry lowered costs on from the queued cells: Dijkstra's search with a queue for every cost (Dial 1969).
 
     The eight ways are written out and gathered without branches, which would be guessed wrong too often.

@@ -50,7 +50,7 @@ def announce_compiling(say: Callable[[str], None]) -> None:
 def kernel_digest(package: Path) -> str:
     """Return a name for the state of a package's kernels: its place and every source that they are compiled from."""
     digest = hashlib.sha256(str(package).encode())
-    for source in sorted(package.glob("*/*.py")):
+    for source in sorted((*package.glob("*/*.py"), *package.glob("*/*/*.py"))):
         text = source.read_bytes()
         # constants of files without kernels are frozen into the kernels of those that import them
         if source.parent.name in ("core", "sim") or b"njit" in text:

@@ -1,0 +1,41 @@
+"""Who goes where: a drone deals the targets it knows out to itself and the peers it knows of, and takes its own."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from imagine.train.baselines.survey import distance_m, in_sight
+
+
+@numba.njit(cache=True, nogil=True)
+def coordinated_target(ways, utility, targets, states, robots, count, options):  # type: ignore[no-untyped-def]
+    """Return the index of the target that robot 0 gets in the greedy dealing of Burgard et al. (2005); -1 for none.
+
+    Robot and target of the greatest worth, utility less weighted way, come first; then what can be seen from that
+    target is worth less to all others, in proportion to how near it is. `ways` float64 `[robots, targets]` metres,
+    inf where there is none; `utility` float64 `[targets]` is overwritten; `options` (cost weight, logarithmic,
+    discount range).
+    """
+    weight, logarithmic, discount_range = options
+    columns = states.shape[1]
+    served = np.zeros(robots, np.bool_)
+    for _ in range(robots):
+        best, best_robot, best_target = -np.inf, -1, -1
+        for target in range(count):
+            worth = math.log(max(utility[target], 1e-9)) if logarithmic else utility[target]
+            for robot in range(robots):
+                if not served[robot] and ways[robot, target] < np.inf and worth - weight * ways[robot, target] > best:
+                    best, best_robot, best_target = worth - weight * ways[robot, target], robot, target
+        if best_robot <= 0:
+            return best_target
+        served[best_robot] = True
+        for target in range(count):
+            apart = distance_m(targets[target], targets[best_target], columns)
+            if target == best_target:
+                utility[target] = 0.0
+            elif apart < discount_range and in_sight(states, targets[best_target], targets[target]):
+                utility[target] *= apart / discount_range
+    return -1

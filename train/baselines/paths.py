@@ -1,0 +1,126 @@
+"""Following a way on the planning grid smoothly: straight for the farthest point of it that is clear to fly to."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+from imagine.core.frontier import PAD, UNKNOWN
+from imagine.core.frontier_paths import FAR, NEAR, OPEN
+
+_STRAIGHT, _NEAR_WEIGHT = 5.0, 3.0  # of costs, as in core.frontier_paths
+_LOOKAHEAD_CELLS = 30
+_PATIENCE = 4  # points further on that are tried past one that is not clear
+
+
+@numba.njit(cache=True, nogil=True)
+def trace_back(path, cost, kinds, goal):  # type: ignore[no-untyped-def]
+    """Write the cheapest way to the flat cell `goal` into `path` (int32 `[n]`), its start first; return its length.
+
+    `cost` as of `fill_ways`. A way longer than n keeps its first n cells; 0 where there is none.
+    """
+    columns = cost.shape[1]
+    flat, flat_kinds = cost.ravel(), kinds.ravel()
+    if not 0 <= flat[goal] < FAR:
+        return 0
+    length, cell = 1, goal
+    while flat[cell] > 0:
+        cell = _step_back(flat, flat_kinds, cell, columns)
+        length += 1
+    cell = goal
+    for k in range(length - 1, -1, -1):
+        if k < path.shape[0]:
+            path[k] = cell
+        if k > 0:
+            cell = _step_back(flat, flat_kinds, cell, columns)
+    return min(length, path.shape[0])
+
+
+@numba.njit(cache=True, nogil=True)
+def _step_back(costs, kinds, cell, columns):  # type: ignore[no-untyped-def]
+    """Return the neighbour that the cheapest way to `cell` comes from."""
+    best, best_cost = cell, costs[cell]
+    for d_row in range(-1, 2):
+        for d_column in range(-1, 2):
+            other = cell + d_row * columns + d_column
+            cost = costs[other]
+            if cost < 0 or cost >= best_cost:
+                continue
+            if d_row != 0 and d_column != 0 and (costs[cell + d_row * columns] < 0 or costs[cell + d_column] < 0):
+                continue
+            step = 7 if d_row != 0 and d_column != 0 else 5
+            if (kinds[cell] | kinds[other]) & NEAR:
+                step *= 3
+            if cost + step == costs[cell]:
+                best, best_cost = other, cost
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def line_cost(kinds, row0, column0, row1, column1):  # type: ignore[no-untyped-def]
+    """Return the cost of flying straight between two points (in planning cells), -1 where that is not possible.
+
+    In the units of the grid's costs, a metre beside obstacles counting threefold; the first half cell is free.
+    """
+    rows, columns = kinds.shape
+    d_row, d_column = row1 - row0, column1 - column0
+    length = math.sqrt(d_row * d_row + d_column * d_column)
+    steps = math.ceil(length / 0.5)
+    cost = 0.0
+    for k in range(1, steps + 1):
+        share = k / steps
+        row, column = math.floor(row0 + share * d_row), math.floor(column0 + share * d_column)
+        if not (0 <= row < rows and 0 <= column < columns):
+            return -1.0
+        kind = kinds[row, column]
+        if not kind & OPEN:
+            if share * length > 0.75:
+                return -1.0
+            continue
+        cost += _NEAR_WEIGHT if kind & NEAR else 1.0
+    return cost * _STRAIGHT * length / max(steps, 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def follow(path, length, begin, kinds, states, row, column):  # type: ignore[no-untyped-def]
+    """Return (d_row, d_column, at, off): which way to fly from (row, column), in planning cells, along a path.
+
+    `at` is the point of the path that the drone is nearest to, searched from `begin` on; `off` how many cells it is
+    away from it.
+    """
+    columns = kinds.shape[1]
+    at, off = begin, 1e9
+    for k in range(max(0, begin - 3), min(length, begin + 12)):
+        d_row, d_column = path[k] // columns + 0.5 - row, path[k] % columns + 0.5 - column
+        square = math.sqrt(d_row * d_row + d_column * d_column)
+        if square < off:
+            at, off = k, square
+    target, misses = min(at + 1, length - 1), 0
+    along = 0.0
+    before = path[at]
+    for k in range(at + 1, min(length, at + _LOOKAHEAD_CELLS)):
+        cell = path[k]
+        diagonal = cell // columns != before // columns and cell % columns != before % columns
+        step = 7.0 if diagonal else 5.0
+        near = (kinds[cell // columns, cell % columns] | kinds[before // columns, before % columns]) & NEAR
+        along += step * _NEAR_WEIGHT if near else step
+        before = cell
+        straight = line_cost(kinds, row, column, cell // columns + 0.5, cell % columns + 0.5)
+        if 0.0 <= straight <= along + 0.05 * along + 4.0 * off + 1.0:
+            target, misses = k, 0
+        else:
+            misses += 1
+            if misses > _PATIENCE:
+                break
+    cell = path[target]
+    d_row, d_column = cell // columns + 0.5 - row, cell % columns + 0.5 - column
+    if target == length - 1 and d_row * d_row + d_column * d_column < 2.25:
+        # at the goal: on toward what is unknown beyond it
+        i, j = cell // columns, cell % columns
+        for k in range(max(PAD, i - 1), i + 2):
+            for m in range(max(PAD, j - 1), j + 2):
+                if states[k, m] == UNKNOWN:
+                    d_row += k - i
+                    d_column += m - j
+    return d_row, d_column, at, off

@@ -1,0 +1,70 @@
+"""A frontier baseline as a pilot: surveys, deals, and flies all drones of a batch of worlds."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from imagine.sim.exploration import Exploration, Observation
+from imagine.train.baselines.parameters import Parameters
+from imagine.train.baselines.plan_state import PlanState, forget, plan_scratch, plan_state
+from imagine.train.baselines.planning import deal_worlds, fly_worlds, survey_worlds
+from imagine.train.baselines.survey import gain_rays
+from imagine.train.pilots import Actions
+
+Dealing = Literal["greedy", "hungarian"]
+
+
+class FrontierPilot:
+    """Flies every drone to a frontier of its own map, chosen by `parameters` and `dealing`."""
+
+    def __init__(self, name: str, parameters: Parameters, dealing: Dealing = "greedy") -> None:
+        """Make a pilot that has yet to begin."""
+        self.name = name
+        self._parameters, self._dealing = parameters, dealing
+        self._rays = gain_rays(parameters.gain_range_m)
+
+    def begin(self, env: Exploration) -> None:
+        """Make room for the worlds of `env`."""
+        rows, columns = env.maps.arrays.kinds.shape[2:]
+        self._state = plan_state(env.worlds, env.drones, rows, columns)
+        self._scratch = [plan_scratch(rows, columns) for _ in range(env.twin.workers.threads)]
+
+    def forget(self, worlds: NDArray[np.bool_]) -> None:
+        """Drop the choices made in these worlds."""
+        forget(self._state, worlds)
+
+    def act(self, env: Exploration, observation: Observation) -> Actions:
+        """Return full speed toward each drone's frontier, nan where it is dead or knows of none that it can get to."""
+        state, maps, air = self._state, env.maps.arrays, env.air
+        over = env.twin.workers.over
+        over(
+            env.worlds, survey_worlds, state, maps, env.estimates, env.alive, env.decisions.intents, air.state.peers,
+            env.ticks, air.rules.ticks_per_s, self._parameters, self._rays, scratch=self._scratch,
+        )  # fmt: skip
+        if self._dealing == "greedy":
+            over(env.worlds, deal_worlds, state, maps, env.alive, self._parameters)
+        else:
+            deal_by_assignment(state, self._parameters.cost_weight_per_m)
+        actions = np.full((env.worlds, env.drones, env.settings.action.size), np.nan, np.float32)
+        hold_s = (env.settings.action.decision_ticks - 1) * env.dt
+        over(
+            env.worlds, fly_worlds, actions, state, maps, env.estimates, env.alive, env.decisions.parameters, hold_s
+        )  # fmt: skip
+        return actions
+
+
+def deal_by_assignment(state: PlanState, weight: float) -> None:
+    """Deal targets out where a choice is due, so that the sum of weighted ways less utilities is least."""
+    for world, drone in np.argwhere(state.due):
+        count, robots = state.count[world, drone], state.robots[world, drone]
+        state.dealt[world, drone] = -1
+        if count:
+            price = weight * state.ways[world, drone, :robots, :count] - state.utility[world, drone, :count]
+            price = np.where(np.isfinite(price), price, 1e6)
+            chosen, dealt = linear_sum_assignment(price)
+            mine = dealt[chosen == 0]
+            state.dealt[world, drone] = mine[0] if len(mine) else int(np.argmin(price[0]))

@@ -1,0 +1,160 @@
+"""What a drone can choose from: its frontiers in clusters, the way to each, and what each may show.
+
+All grids are padded planning grids as in `imagine.core.frontier`, of the drone's own belief; cells are flat indices.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine.core.frontier import OCCUPIED, PAD, PLAN_CELL, UNKNOWN
+from imagine.core.frontier_paths import BLOCKED, FAR, FRONTIER, OPEN, settle
+
+MOST_TARGETS = 96
+"""Clusters that are considered; what lies beyond, in the order of the grid, waits until others are gone."""
+GAIN_RAYS = 48
+
+
+@numba.njit(cache=True, nogil=True)
+def nearest_open(kinds, row, column, rings):  # type: ignore[no-untyped-def]
+    """Return the flat cell that can be flown in nearest to (row, column), at most `rings` away; -1 where none is."""
+    rows, columns = kinds.shape
+    best, best_square = -1, 1 << 30
+    for ring in range(rings + 1):
+        if ring * ring > best_square:
+            break
+        for i in range(max(PAD, row - ring), min(rows - PAD, row + ring + 1)):
+            on_edge = abs(i - row) == ring
+            step = 1 if on_edge or ring == 0 else 2 * ring
+            for j in range(column - ring, column + ring + 1, step):
+                if PAD <= j < columns - PAD and kinds[i, j] & OPEN:
+                    square = (i - row) * (i - row) + (j - column) * (j - column)
+                    if square < best_square:
+                        best, best_square = i * columns + j, square
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_ways(cost, kinds, start, scratch):  # type: ignore[no-untyped-def]
+    """Fill `cost` (int16, padded, see `FrontierField`) with the cheapest ways from the flat cell `start`."""
+    flat, flat_kinds = cost.ravel(), kinds.ravel()
+    for cell in range(flat.shape[0]):
+        flat[cell] = FAR if flat_kinds[cell] & OPEN else BLOCKED
+    heads, entry_cell, entry_next = scratch
+    flat[start] = 0
+    entry_cell[0], entry_next[0], heads[0] = start, -1, 0
+    settle(flat, flat_kinds, np.uint32(cost.shape[1]), 0, 1, scratch)
+
+
+@numba.njit(cache=True, nogil=True)
+def find_targets(targets, kinds, cost, banned, radius, marks, queue):  # type: ignore[no-untyped-def]
+    """Write the representative cells of frontier clusters to `targets` (int32 `[n]`); return how many there are.
+
+    A cluster is connected (8 neighbours), reached by `cost`, and within `radius` cells of its first cell. Its
+    representative is the member nearest to the mean of all. Cells within 2 of a `banned` one (flat, -1 for none) are
+    left out. `marks` (uint8, flat) is all 0 and is left so; `queue` int32 `[cells]`.
+    """
+    rows, columns = kinds.shape
+    found, listed = 0, 0
+    for row in range(PAD, rows - PAD):
+        for column in range(PAD, columns - PAD):
+            cell = row * columns + column
+            if not kinds[row, column] & FRONTIER or marks[cell] or not 0 <= cost[row, column] < FAR:
+                continue
+            if _is_banned(banned, row, column, columns):
+                continue
+            first = listed
+            marks[cell] = 1
+            queue[listed] = cell
+            listed += 1
+            at, sum_row, sum_column = first, 0, 0
+            while at < listed:
+                here = queue[at]
+                at += 1
+                i, j = here // columns, here % columns
+                sum_row, sum_column = sum_row + i, sum_column + j
+                for k in range(max(i - 1, row - radius), min(i + 2, row + radius + 1)):
+                    for m in range(max(j - 1, column - radius), min(j + 2, column + radius + 1)):
+                        other = k * columns + m
+                        if (
+                            kinds[k, m] & FRONTIER
+                            and not marks[other]
+                            and 0 <= cost[k, m] < FAR
+                            and not _is_banned(banned, k, m, columns)
+                        ):
+                            marks[other] = 1
+                            queue[listed] = other
+                            listed += 1
+            mean_row, mean_column = sum_row / (listed - first), sum_column / (listed - first)
+            best, best_square = queue[first], 1e18
+            for k in range(first, listed):
+                d_row, d_column = queue[k] // columns - mean_row, queue[k] % columns - mean_column
+                square = d_row * d_row + d_column * d_column
+                if square < best_square:
+                    best, best_square = queue[k], square
+            if found < targets.shape[0]:
+                targets[found] = best
+                found += 1
+    for k in range(listed):
+        marks[queue[k]] = 0
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_banned(banned, row, column, columns):  # type: ignore[no-untyped-def]
+    for k in range(banned.shape[0]):
+        if banned[k] >= 0 and abs(banned[k] // columns - row) <= 2 and abs(banned[k] % columns - column) <= 2:
+            return True
+    return False
+
+
+def gain_rays(range_m: float) -> NDArray[np.float64]:
+    """Return the directions that gain is looked for in, float64 `[GAIN_RAYS, 2]` (rows, columns a planning cell)."""
+    bearing = (np.arange(GAIN_RAYS) + 0.5) * (2.0 * math.pi / GAIN_RAYS)
+    return np.column_stack((np.sin(bearing), np.cos(bearing)))
+
+
+@numba.njit(cache=True, nogil=True)
+def expected_gain(states, cell, reach, rays):  # type: ignore[no-untyped-def]
+    """Return the unknown share of the disc of `reach` planning cells around a flat cell that no obstacle hides.
+
+    What is unknown hides nothing: an upper bound, as for a next best view (Gonzalez-Banos and Latombe 2002).
+    """
+    rows, columns = states.shape
+    row0, column0 = cell // columns + 0.5, cell % columns + 0.5
+    total, unknown = 0.0, 0.0
+    for step in range(1, reach + 1):
+        total += step * rays.shape[0]
+    for ray in range(rays.shape[0]):
+        d_row, d_column = rays[ray, 0], rays[ray, 1]
+        for step in range(1, reach + 1):
+            row, column = int(row0 + step * d_row), int(column0 + step * d_column)
+            if row < 0 or row >= rows or column < 0 or column >= columns or states[row, column] == OCCUPIED:
+                break
+            if states[row, column] == UNKNOWN:
+                unknown += step
+    return unknown / total
+
+
+@numba.njit(cache=True, nogil=True)
+def in_sight(states, first, second):  # type: ignore[no-untyped-def]
+    """Tell whether no obstacle stands between two flat cells."""
+    columns = states.shape[1]
+    row, column = first // columns, first % columns
+    d_row, d_column = second // columns - row, second % columns - column
+    steps = max(abs(d_row), abs(d_column))
+    for k in range(1, steps):
+        if states[row + round(d_row * k / steps), column + round(d_column * k / steps)] == OCCUPIED:
+            return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def distance_m(first, second, columns):  # type: ignore[no-untyped-def]
+    """Return the straight distance between two flat cells, metres."""
+    d_row, d_column = first // columns - second // columns, first % columns - second % columns
+    return PLAN_CELL * math.sqrt(np.float64(d_row * d_row + d_column * d_column))
