@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.frontier_paths import search_scratch
-from imagine.train.baselines.survey import MOST_TARGETS
+from imagine.core.frontier_targets import MOST_TARGETS
 
 PATH_CELLS = 512
 """Cells of a way that are kept: the next hundred metres."""

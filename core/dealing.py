@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from imagine.train.baselines.survey import distance_m, in_sight
+from imagine.core.frontier_targets import distance_m, in_sight
 
 
 @numba.njit(cache=True, nogil=True)
