@@ -39,11 +39,12 @@ class FrontierField:
 
     `cost`: int16 `[rows + 2 PAD, columns + 2 PAD]`, UNIT_M along the cheapest known path, a metre beside obstacles
     counting threefold; FAR where no frontier can be reached, BLOCKED where nothing flies. `padded_states`: uint8 of
-    the same shape, UNKNOWN, FREE or OCCUPIED.
+    the same shape, UNKNOWN, FREE or OCCUPIED; `kinds`: uint8 of the same shape, bits as in `frontier_paths`.
     """
 
     cost: NDArray[np.int16]
     padded_states: NDArray[np.uint8]
+    kinds: NDArray[np.uint8]
 
     @cached_property
     def distance(self) -> NDArray[np.float32]:
@@ -221,7 +222,7 @@ def frontier_field(belief: NDArray[np.int8]) -> FrontierField:
     dirty, is_dirty = np.empty(cost.size, np.int32), np.zeros(cost.size, np.uint8)
     _field_from_nothing(belief, states, kinds, cost, dirty, is_dirty, search_scratch(cost.size))
     inner = slice(plan_rows + 2 * PAD), slice(plan_columns + 2 * PAD)
-    return FrontierField(np.ascontiguousarray(cost[inner]), np.ascontiguousarray(states[inner]))
+    return FrontierField(*(np.ascontiguousarray(grid[inner]) for grid in (cost, states, kinds)))
 
 
 @numba.njit(cache=True, nogil=True)

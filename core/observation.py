@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from imagine.core.errors import InputError
 from imagine.core.frames import Pose
 from imagine.core.frontier import PAD, UNIT_M, FrontierField, cost_at
+from imagine.core.frontier_choice import choice_scratch, fill_frontiers
 from imagine.core.frontier_paths import FAR
 from imagine.core.lidar import LidarSpec, Scan
 from imagine.core.observation_spec import ObservationSpec
@@ -306,5 +307,12 @@ def observe(
         fill_options(
             observation["motion"][MOTION:], pose.x, pose.y, pose.yaw, known.positions, known.ages_s,
             option_parameters(spec),
+        )  # fmt: skip
+    if spec.frontiers:
+        known = peers or PeerPoses.none()
+        rows, columns = field.kinds.shape
+        fill_frontiers(
+            observation["frontiers"], field.kinds, field.padded_states, origin_cells[0], origin_cells[1],
+            pose.x, pose.y, turn, known.positions, known.ages_s, spec.peer_memory_s, choice_scratch(rows, columns),
         )  # fmt: skip
     return observation

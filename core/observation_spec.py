@@ -7,9 +7,10 @@ from typing import Any, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from imagine.core.config import Settings
+from imagine.core.frontier_choice import FRONTIER_NUMBERS
 from imagine.core.raster import CELL
 
-_OPTIONS = ("position", "heading", "peers", "peer_places", "visits")
+_OPTIONS = ("position", "heading", "peers", "peer_places", "frontiers", "visits")
 
 
 class ObservationSpec(Settings):
@@ -23,6 +24,7 @@ class ObservationSpec(Settings):
     (`team`: self, peers). To `motion` are appended, in this order: `position`, x and y in the map, along the map's axes
     whatever `axes` says; `heading`, cosine and sine of the yaw in the map; `peers`, that many distances, nearest first;
     `peer_places`, for that many peers, nearest first, two offsets along `axes` and how fresh the report is.
+    `frontiers` adds an input of its own: that many frontiers, each as `frontier_choice.fill_frontiers` describes it.
     """
 
     version: Literal[1, 2] = Field(default=1, description="2 where an option is on; may be left out")
@@ -46,6 +48,7 @@ class ObservationSpec(Settings):
     peer_places: int = Field(default=0, ge=0, le=15, description="so many nearest peers are seen where they were heard")
     peer_places_range_m: float = Field(default=10.0, gt=0.0, description="offset to a peer that reads as 1, metres")
     peer_memory_s: float = Field(default=20.0, gt=0.0, description="reports older than this are forgotten")
+    frontiers: int = Field(default=0, ge=0, le=32, description="so many frontiers to choose from are seen, best first")
     visits: Literal["off", "self", "team"] = Field(
         default="off", description="see how long this drone, or it and its peers, have been where"
     )
@@ -89,8 +92,11 @@ class ObservationSpec(Settings):
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each input of the policy, by name, without the batch axis; all are float32."""
-        return {
+        shapes: dict[str, tuple[int, ...]] = {
             "views": ((2 + self.visit_channels) * len(self.view_scales_m), self.view_cells, self.view_cells),
             "lidar": (self.lidar_sectors,),
             "motion": (3 + 2 * self.position + 2 * self.heading + self.peers + 3 * self.peer_places,),
         }
+        if self.frontiers:
+            shapes["frontiers"] = (self.frontiers, FRONTIER_NUMBERS)
+        return shapes

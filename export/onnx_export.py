@@ -73,7 +73,7 @@ def export_onnx(checkpoint: Path, out: Path, name: str | None = None) -> Inspect
 
 def _to_onnx(actor: Actor, spec: ObservationSpec) -> bytes:
     """Return the actor as a serialised ONNX model."""
-    example = tuple(torch.zeros((2, *spec.shapes[key])) for key in OBSERVATION_KEYS)
+    example = tuple(torch.zeros((2, *spec.shapes[key])) for key in _keys(spec))
     batch = torch.export.Dim("batch")
     quiet = logging.getLogger("torch.onnx")
     level = quiet.level
@@ -84,7 +84,7 @@ def _to_onnx(actor: Actor, spec: ObservationSpec) -> bytes:
             program = torch.onnx.export(
                 actor,
                 example,
-                input_names=list(OBSERVATION_KEYS),
+                input_names=_keys(spec),
                 output_names=[OUTPUT],
                 dynamic_shapes=tuple({0: batch} for _ in example),
                 opset_version=_OPSET,
@@ -103,16 +103,21 @@ def _to_onnx(actor: Actor, spec: ObservationSpec) -> bytes:
     return content
 
 
+def _keys(spec: ObservationSpec) -> list[str]:
+    """Return the names of the actor's inputs in the order of its `forward`."""
+    return [key for key in OBSERVATION_KEYS if key in spec.shapes]
+
+
 def parity(actor: Actor, model: bytes, spec: ObservationSpec, observations: int = PARITY_OBSERVATIONS) -> float:
     """Return the largest difference between ONNX and torch over random observations, one batch and one by one."""
     rng = np.random.default_rng(0)
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     inputs: dict[str, NDArray[np.float32]] = {
-        key: rng.uniform(-1.0, 1.0, (observations, *spec.shapes[key])).astype(np.float32) for key in OBSERVATION_KEYS
+        key: rng.uniform(-1.0, 1.0, (observations, *spec.shapes[key])).astype(np.float32) for key in _keys(spec)
     }
     inputs["lidar"] = np.abs(inputs["lidar"])
     with torch.no_grad():
-        expected = actor(*(torch.from_numpy(inputs[key]) for key in OBSERVATION_KEYS)).numpy()
+        expected = actor(*(torch.from_numpy(inputs[key]) for key in _keys(spec))).numpy()
     batched = session.run([OUTPUT], inputs)[0]
     single = np.concatenate(
         [session.run([OUTPUT], {key: value[i : i + 1] for key, value in inputs.items()})[0] for i in range(16)]

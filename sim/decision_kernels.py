@@ -9,6 +9,7 @@ import numba
 import numpy as np
 
 from imagine.core.action import intent_kernel
+from imagine.core.frontier_choice import fill_frontiers
 from imagine.core.observation import MOTION, fill_options
 from imagine.core.visits import count_peer_visits, count_visit, fill_visits
 
@@ -89,4 +90,21 @@ def fill_visit_views(  # type: ignore[no-untyped-def]
             fill_visits(
                 views[world, drone, maps:], own[world, drone], peers[world, drone], team,
                 origins[world, 0], origins[world, 1], x, y, yaw if heading_axes else 0.0, scales, levels,
+            )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_frontier_choices(  # type: ignore[no-untyped-def]
+    first, last, frontiers, kinds, states, origins, poses, positions, ages, memory_s, heading_axes, alive, scratch
+):
+    """Fill `frontiers` (float32 `[world, drone, n, numbers]`) with what the living can choose from."""
+    for world in range(first, last):
+        for drone in range(frontiers.shape[1]):
+            if not alive[world, drone]:
+                continue
+            x, y, yaw = poses[world, drone]
+            fill_frontiers(
+                frontiers[world, drone], kinds[world, drone], states[world, drone], origins[world, 0],
+                origins[world, 1], x, y, yaw if heading_axes else 0.0, positions[world, drone], ages[world, drone],
+                memory_s, scratch,
             )  # fmt: skip

@@ -7,12 +7,15 @@ from numpy.typing import NDArray
 
 from imagine.core.action import Parameters, action_parameters
 from imagine.core.contract import ActionSpec
+from imagine.core.frontier import PAD
+from imagine.core.frontier_choice import choice_scratch
 from imagine.core.observation import MOTION, option_parameters
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.visits import visit_levels
 from imagine.sim.air import Air
 from imagine.sim.decision_kernels import (
     count_visits,
+    fill_frontier_choices,
     fill_option_numbers,
     fill_visit_views,
     hear_peers,
@@ -56,6 +59,9 @@ class DecisionState:
         self.ages = np.full((worlds, drones, drones), np.inf)
         self.explorer_ages = self.ages.copy()
         self.intents = np.zeros((worlds, drones, 3))
+        padded = rows // 2 + 2 * PAD, columns // 2 + 2 * PAD
+        threads = self._workers.threads if observation.frontiers else 0
+        self._choice_scratch = [choice_scratch(*padded) for _ in range(threads)]
 
     def clear(self, world: int) -> None:
         """Forget everything of a world."""
@@ -78,7 +84,11 @@ class DecisionState:
         Call it once after the air has delivered what arrives in the tick, and once at a launch. Nobody is known under
         the protocol `off`, as on board.
         """
-        if self._spec.peers == self._spec.peer_places == 0 and not self._sees_team and self._spec.visits == "off":
+        if (
+            self._spec.peers == self._spec.peer_places == self._spec.frontiers == 0
+            and not self._sees_team
+            and self._spec.visits == "off"
+        ):
             return
         worlds = len(poses)
         if air.rules.shares:
@@ -108,6 +118,26 @@ class DecisionState:
                 worlds, fill_visit_views, views, self.own_visits, self.peer_visits, self._sees_team, origins, poses,
                 self._spec.axes == "heading", self._scales, self._levels,
             )  # fmt: skip
+
+    def fill_frontiers(
+        self,
+        frontiers: NDArray[np.float32],
+        kinds: NDArray[np.uint8],
+        states: NDArray[np.uint8],
+        poses: NDArray[np.float64],
+        origins: NDArray[np.int64],
+        alive: NDArray[np.bool_],
+        shown: NDArray[np.bool_],
+    ) -> None:
+        """Fill what drones can choose from, `[worlds, drones, n, numbers]`, in the `shown` worlds (`[worlds]`).
+
+        `kinds` and `states` are the padded planning grids of their maps, uint8 `[worlds, drones, rows, columns]`.
+        """
+        spec = self._spec
+        self._workers.over(
+            len(poses), fill_frontier_choices, frontiers, kinds, states, origins, poses, self.positions, self.ages,
+            spec.peer_memory_s, spec.axes == "heading", alive & shown[:, None], scratch=self._choice_scratch,
+        )  # fmt: skip
 
     def decide(self, actions: NDArray[np.float32], poses: NDArray[np.float64]) -> None:
         """Let the decisions `actions` `[worlds, drones, size]`, taken at `poses`, stand until the next call."""

@@ -291,6 +291,11 @@ class Exploration:
         self.decisions.sense(self.estimates, self.air, self.ticks, self.maps.origins, self.alive, active)
         if observes:
             self.decisions.fill(seen["views"], seen["motion"], self.estimates, self.maps.origins)
+            if self.settings.observation.frontiers:
+                self.decisions.fill_frontiers(
+                    seen["frontiers"], maps.kinds, maps.states, self.estimates, self.maps.origins, self.alive,
+                    shown != WAITING,
+                )  # fmt: skip
 
     def time_stages(self) -> None:
         """Begin to add up the processor time that each stage of a tick takes, see `stage_seconds`."""

@@ -6,6 +6,7 @@ Learning from the planner's own flights alone fails: the first error leads where
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,12 +18,16 @@ from imagine.core.errors import WorkError
 from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.metrics import EpisodeMetrics
 from imagine.train.networks import Actor
-from imagine.train.rollout import OBSERVATION_KEYS, actor_inputs, env_actions, policy_tensors
+from imagine.train.pilots import Pilot
+from imagine.train.rollout import actor_inputs, env_actions, policy_tensors
 
 
 class ImitationSettings(Settings):
     """How long and how the planner is imitated."""
 
+    teacher: Literal["frontier", "coordinated", "hungarian"] = Field(
+        default="coordinated", description="the planner whose advice labels the states that are visited"
+    )
     agent_steps: int = Field(default=250_000, ge=0, description="labelled decisions; 0 leaves imitation out")
     round_steps: int = Field(default=32, ge=1, description="steps of every world between two rounds of learning")
     gradient_steps: int = Field(default=24, ge=1, description="steps of Adam a round")
@@ -74,6 +79,7 @@ def collect_labels(
     env: Exploration,
     observation: Observation,
     actor: Actor,
+    teacher: Pilot,
     buffer: LabelBuffer,
     steps: int,
     planner_share: float,
@@ -89,15 +95,16 @@ def collect_labels(
     added = 0
     for _ in range(steps):
         tensors = policy_tensors(observation)
-        labels = torch.from_numpy(env.planner_actions().reshape(len(planner_flies), -1))
+        labels = torch.from_numpy(teacher.act(env, observation).reshape(len(planner_flies), -1))
         labelled = torch.isfinite(labels).all(dim=1)
-        buffer.add({key: tensors[key][labelled] for key in OBSERVATION_KEYS}, labels[labelled])
+        buffer.add({key: tensor[labelled] for key, tensor in tensors.items()}, labels[labelled])
         added += int(labelled.sum())
         mean = actor(*actor_inputs(tensors))
         actions = mean + actor.spread().exp() * torch.randn(mean.shape, generator=generator)
         by_planner = planner_flies & labelled
         actions[by_planner] = labels[by_planner]
         step = env.step(env_actions(actions, env))
+        teacher.forget(step.done)
         episodes.extend(step.episodes)
         observation = step.observation
     return observation, episodes, added

@@ -90,6 +90,29 @@ class LidarEncoder(nn.Module):
         return torch.relu(self.linear(self.convolutions(lidar.unsqueeze(1)).flatten(1)))
 
 
+class FrontierEncoder(nn.Module):
+    """Scores the frontiers shown, `[batch, n, numbers]`, in the light of the rest, and mixes them by a softmax.
+
+    Frontiers are a set: whatever their order, the same numbers score the same.
+    """
+
+    def __init__(self, numbers: int, context: int, features: int) -> None:
+        super().__init__()
+        self.context = _orthogonal(nn.Linear(context, features))
+        self.each = _orthogonal(nn.Linear(numbers, features))
+        self.mixed = _orthogonal(nn.Linear(features, features))
+        self.score = _orthogonal(nn.Linear(features, 1), gain=1.0)
+
+    def forward(self, frontiers: Tensor, context: Tensor) -> Tensor:
+        """Return features, and last the mixed direction (2), `[batch, features + 2]`; zeros where none is shown."""
+        hidden = torch.relu(self.each(frontiers) + self.context(context).unsqueeze(1))
+        hidden = torch.relu(self.mixed(hidden))
+        shown = frontiers[..., :1]
+        scores = self.score(hidden).float() + (shown - 1.0) * 1e4
+        weights = torch.softmax(scores, dim=1) * shown
+        return torch.cat([(weights * hidden).sum(dim=1), (weights * frontiers[..., 1:3]).sum(dim=1)], dim=1)
+
+
 class Actor(Computing):
     """The policy: a drone's observation to the mean of its action; the spread is one number per action component."""
 
@@ -100,17 +123,25 @@ class Actor(Computing):
         widths = settings.view_channels
         self.views = ImageEncoder(_view_convolutions(channels, widths), channels, cells, hidden)
         self.lidar = LidarEncoder(spec.lidar_sectors, settings.lidar_channels, hidden // 2)
-        self.trunk = nn.Sequential(
-            _orthogonal(nn.Linear(hidden + hidden // 2 + spec.shapes["motion"][0], hidden)), nn.ReLU()
-        )
+        seen = hidden + hidden // 2 + spec.shapes["motion"][0]
+        self.frontiers: FrontierEncoder | None = None
+        if spec.frontiers:
+            self.frontiers = FrontierEncoder(spec.shapes["frontiers"][1], seen, hidden // 2)
+            self.steering = nn.Parameter(torch.tensor(1.5))
+            seen += hidden // 2 + 2
+        self.trunk = nn.Sequential(_orthogonal(nn.Linear(seen, hidden)), nn.ReLU())
         self.mean = _orthogonal(nn.Linear(hidden, action_size), gain=0.01)  # begin near standing still
         self.log_std = nn.Parameter(torch.full((action_size,), settings.log_std))
 
-    def forward(self, views: Tensor, lidar: Tensor, motion: Tensor) -> Tensor:
+    def forward(self, views: Tensor, lidar: Tensor, motion: Tensor, frontiers: Tensor | None = None) -> Tensor:
         """Return the action's mean, `[batch, action size]` in (-1, 1); this is what flies."""
         with autocast(self.dtype, views.device):
-            features = self.trunk(torch.cat([self.views(views.to(self.dtype)), self.lidar(lidar), motion], dim=1))
-        return torch.tanh(self.mean(features.float()))
+            seen = torch.cat([self.views(views.to(self.dtype)), self.lidar(lidar), motion], dim=1)
+            if self.frontiers is None or frontiers is None:
+                return torch.tanh(self.mean(self.trunk(seen).float()))
+            chosen = self.frontiers(frontiers, seen)
+            features = self.trunk(torch.cat([seen, chosen], dim=1))
+        return torch.tanh(self.mean(features.float()) + self.steering * chosen[:, -2:].float())
 
     def spread(self) -> Tensor:
         """Return the logarithm of the standard deviation with which training draws actions, `[action size]`."""
@@ -181,13 +212,20 @@ class Critic(Computing):
         self.views = ImageEncoder(_patch_convolutions(channels, widths), channels, cells, hidden)
         self.level = ImageEncoder(_patch_convolutions(CRITIC_CHANNELS, widths), CRITIC_CHANNELS, CRITIC_CELLS, hidden)
         self.lidar = LidarEncoder(spec.lidar_sectors, settings.critic_lidar_channels, hidden // 4)
-        self.trunk = nn.Sequential(
-            _orthogonal(nn.Linear(2 * hidden + hidden // 4 + spec.shapes["motion"][0], hidden)), nn.ReLU()
-        )
+        seen = 2 * hidden + hidden // 4 + spec.shapes["motion"][0]
+        self.frontiers: nn.Module | None = None
+        if spec.frontiers:
+            self.frontiers = nn.Sequential(
+                nn.Flatten(), _orthogonal(nn.Linear(math.prod(spec.shapes["frontiers"]), hidden // 2)), nn.ReLU()
+            )
+            seen += hidden // 2
+        self.trunk = nn.Sequential(_orthogonal(nn.Linear(seen, hidden)), nn.ReLU())
         self.value = _orthogonal(nn.Linear(hidden, 1), gain=1.0)
         self.scale = ReturnScale()
 
-    def forward(self, views: Tensor, lidar: Tensor, motion: Tensor, level: Tensor) -> Tensor:
+    def forward(
+        self, views: Tensor, lidar: Tensor, motion: Tensor, level: Tensor, frontiers: Tensor | None = None
+    ) -> Tensor:
         """Return normalised values, `[batch]`, of observations and images of the level `[batch, 5, 32, 32]`.
 
         `scale` turns them into returns and back.
@@ -195,12 +233,15 @@ class Critic(Computing):
         with autocast(self.dtype, views.device):
             images = self.views(views.to(self.dtype)), self.level(level.to(self.dtype))
             seen = [*images, self.lidar(lidar), motion]
+            if self.frontiers is not None and frontiers is not None:
+                seen.append(self.frontiers(frontiers))
             features = self.trunk(torch.cat(seen, dim=1))
         return self.value(features.float()).squeeze(1)  # type: ignore[no-any-return]
 
-    def values(self, views: Tensor, lidar: Tensor, motion: Tensor, level: Tensor) -> Tensor:
-        """Return the discounted returns that the critic expects, `[batch]`."""
-        return self.scale.returns(self(views, lidar, motion, level))
+    def values(self, *inputs: Tensor) -> Tensor:
+        """Return the discounted returns that the critic expects, `[batch]`, by the inputs of `forward`."""
+        normalised: Tensor = self(*inputs)
+        return self.scale.returns(normalised)
 
     def rescale(self, returns: Tensor) -> None:
         """Take the returns of a rollout into the normalisation; the values that the critic gives stay as they are."""

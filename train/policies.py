@@ -19,7 +19,7 @@ from imagine.onboard.policy import OnnxPolicy
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.checkpoint import actor_of, load_checkpoint
 from imagine.train.networks import Actor
-from imagine.train.rollout import OBSERVATION_KEYS
+from imagine.train.rollout import actor_inputs
 
 Arrays = dict[str, NDArray[np.float32]]
 
@@ -41,7 +41,9 @@ def policy_of(actor: Actor, name: str, env: ExplorationSettings | None = None) -
 
     @torch.no_grad()
     def act(observation: Arrays) -> NDArray[np.float32]:
-        result: NDArray[np.float32] = actor(*(torch.from_numpy(observation[key]) for key in OBSERVATION_KEYS)).numpy()
+        result: NDArray[np.float32] = actor(
+            *actor_inputs({key: torch.from_numpy(array) for key, array in observation.items()})
+        ).numpy()
         return result
 
     return Policy(name, act, env)
@@ -59,7 +61,7 @@ def load_policy(path: Path) -> Policy:
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
     def act(observation: Arrays) -> NDArray[np.float32]:
-        result: NDArray[np.float32] = session.run(["action"], {key: observation[key] for key in OBSERVATION_KEYS})[0]
+        result: NDArray[np.float32] = session.run(["action"], dict(observation))[0]
         return result
 
     env = ExplorationSettings(

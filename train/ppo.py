@@ -15,7 +15,7 @@ from imagine.train.gae import advantages_and_returns
 from imagine.train.networks import LOG_STD_RANGE, Actor, Critic, entropy, log_probability
 from imagine.train.ppo_settings import PpoSettings
 from imagine.train.precision import at_precision
-from imagine.train.rollout import OBSERVATION_KEYS, Rollout, actor_inputs, flattened, mean_of, take, values_of
+from imagine.train.rollout import Rollout, actor_inputs, critic_inputs, flattened, mean_of, take, values_of
 
 __all__ = ["Optimisers", "PpoSettings", "update"]
 
@@ -137,7 +137,7 @@ class _Update:
         }
 
     def _improve_critic(self, sample: dict[str, Tensor]) -> dict[str, float]:
-        value, target = self.critic(*(sample[key] for key in (*OBSERVATION_KEYS, "level"))), sample["targets"]
+        value, target = self.critic(*critic_inputs(sample)), sample["targets"]
         error = (value - target).square()
         if self.settings.value_clip is not None:
             near = sample["values"] + (value - sample["values"]).clamp(

@@ -16,7 +16,8 @@ from imagine.sim.metrics import EpisodeMetrics
 from imagine.train.networks import Actor, Critic, log_probability
 from imagine.train.precision import Precision, at_precision
 
-OBSERVATION_KEYS = ("views", "lidar", "motion")
+OBSERVATION_KEYS = ("views", "lidar", "motion", "frontiers")
+"""Inputs of an actor, in the order of its `forward`; the last is there where the specification shows frontiers."""
 
 
 @dataclass
@@ -49,7 +50,7 @@ class Rollout:
 
 def policy_tensors(observation: Observation) -> dict[str, Tensor]:
     """Return what the policy sees, `[worlds, drones, ...]`, as tensors `[agents, ...]`, good as long as it is."""
-    arrays = {key: observation.policy[key] for key in OBSERVATION_KEYS}
+    arrays = observation.policy
     return {key: torch.from_numpy(array.reshape(-1, *array.shape[2:])) for key, array in arrays.items()}
 
 
@@ -59,9 +60,15 @@ def agent_tensors(observation: Observation) -> dict[str, Tensor]:
     return {**policy_tensors(observation), "level": torch.from_numpy(level.reshape(-1, *level.shape[2:]))}
 
 
-def actor_inputs(tensors: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def actor_inputs(tensors: dict[str, Tensor]) -> tuple[Tensor, ...]:
     """Return the actor's inputs in the order of its `forward`."""
-    return tensors["views"], tensors["lidar"], tensors["motion"]
+    return tuple(tensors[key] for key in OBSERVATION_KEYS if key in tensors)
+
+
+def critic_inputs(tensors: dict[str, Tensor]) -> tuple[Tensor, ...]:
+    """Return the critic's inputs in the order of its `forward`."""
+    keys = ("views", "lidar", "motion", "level", "frontiers")
+    return tuple(tensors[key] for key in keys if key in tensors)
 
 
 def stored(tensors: dict[str, Tensor], dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
@@ -175,10 +182,9 @@ def values_of(critic: Critic, rollout: Rollout, minibatch: int) -> tuple[Tensor,
     flat = flattened(rollout)
     count = rollout.rewards.numel()
     pieces = [
-        critic.values(*(flat[key][i : i + minibatch] for key in (*OBSERVATION_KEYS, "level")))
-        for i in range(0, count, minibatch)
+        critic.values(*(piece[i : i + minibatch] for piece in critic_inputs(flat))) for i in range(0, count, minibatch)
     ]
-    last = critic.values(*(rollout.last[key] for key in (*OBSERVATION_KEYS, "level")))
+    last = critic.values(*critic_inputs(rollout.last))
     return torch.cat(pieces).reshape(rollout.rewards.shape), last
 
 

@@ -21,6 +21,7 @@ import torch
 from imagine.core.errors import InputError
 from imagine.sim.exploration import Exploration
 from imagine.train.atomic_file import write_atomically
+from imagine.train.baselines import baseline
 from imagine.train.checkpoint import Checkpoint, Phase, load_checkpoint, load_weights
 from imagine.train.evaluation import evaluate
 from imagine.train.imitation import LabelBuffer, collect_labels, learn
@@ -164,13 +165,15 @@ class Trainer:
         """Let the student fly and learn from the planner's labels, round after round."""
         settings, learner = self.settings.imitation, self.learner
         buffer = LabelBuffer(settings.buffer_samples)
+        teacher = baseline(settings.teacher, self.settings.run.seed)
+        teacher.begin(self.env)
         while self.agent_steps["imitation"] < settings.agent_steps and not self._stop.is_set():
             done_share = self.agent_steps["imitation"] / settings.agent_steps
             began = time.monotonic()
             until = max(settings.planner_share_until, 1e-9)
             planner_share = settings.planner_share * max(0.0, 1.0 - done_share / until)
             self._observation, episodes, labels = collect_labels(
-                self.env, self._observation, learner.actor, buffer, settings.round_steps, planner_share,
+                self.env, self._observation, learner.actor, teacher, buffer, settings.round_steps, planner_share,
                 learner.rng, learner.generator,
             )  # fmt: skip
             collected = time.monotonic()

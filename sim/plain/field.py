@@ -38,7 +38,8 @@ def frontier_field(belief: NDArray[np.int8], ways: Ways) -> FrontierField:
     states = np.pad(plan_states(belief), PAD, constant_values=UNKNOWN)  # so that all have neighbours of neighbours
     free, weight, frontier = _masks(states)
     costs = np.minimum(ways(free, weight, frontier), FAR)
-    return FrontierField(np.where(free, costs, BLOCKED).astype(np.int16), states)
+    kinds = np.where(free, OPEN + NEAR * (weight > 1) + FRONTIER * frontier, 0).astype(np.uint8)
+    return FrontierField(np.where(free, costs, BLOCKED).astype(np.int16), states, kinds)
 
 
 def _shifted(mask: Mask, rows: int, columns: int) -> Mask:

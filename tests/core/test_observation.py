@@ -119,7 +119,7 @@ def test_frontier_pixels_are_relative_to_the_drones_own_cell(x: float, y: float,
     rng = np.random.default_rng(seed)
     cost = np.full((64 + 2 * PAD, 64 + 2 * PAD), BLOCKED, np.int16)
     cost[PAD:-PAD, PAD:-PAD] = np.where(rng.random((64, 64)) < 0.2, BLOCKED, rng.integers(0, 75, (64, 64)))
-    field = FrontierField(cost, np.ones(cost.shape, np.uint8))
+    field = FrontierField(cost, np.ones(cost.shape, np.uint8), np.zeros(cost.shape, np.uint8))
     distance = field.distance
     views = see(SPEC, blank(), Pose(x, y, 0.0), field=field)["views"]
     plan_row, plan_column = math.floor(y / 0.2) + 32, math.floor(x / 0.2) + 32

@@ -107,7 +107,7 @@ def test_the_map_grids_place_makes_no_difference() -> None:
 
 
 def test_far_outside_its_map_it_proposes_nothing() -> None:
-    field = FrontierField(np.zeros((9, 9), np.int16), np.ones((9, 9), np.uint8))
+    field = FrontierField(np.zeros((9, 9), np.int16), np.ones((9, 9), np.uint8), np.zeros((9, 9), np.uint8))
     empty = Scan(0.0, np.full(360, np.inf, np.float32))
     assert plan_velocity(field, (0, 0), Pose(90.0, -90.0, 0.0), empty, LIDAR, 0.8) is None
 

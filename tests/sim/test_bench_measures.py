@@ -28,7 +28,10 @@ SMALL = BenchPlan(
 
 def test_arrays_are_counted_once_whoever_looks_at_them() -> None:
     whole = np.zeros((100, 10))
-    scan, field = Scan(0.0, np.zeros(3, np.float32)), FrontierField(np.zeros((4, 5), np.int16), np.zeros(9, np.uint8))
+    scan, field = (
+        Scan(0.0, np.zeros(3, np.float32)),
+        FrontierField(np.zeros((4, 5), np.int16), np.zeros(9, np.uint8), np.zeros(9, np.uint8)),
+    )
     seen = {"a": whole[:50], "b": whole[50:], "c": scan, "d": field}
     assert array_bytes(seen) == 8000 + 12 + 40 + 9
     assert array_bytes([seen, (seen, whole.T), {1: whole}]) == array_bytes(seen)

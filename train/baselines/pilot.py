@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from imagine.core.frontier_targets import gain_rays
 from imagine.sim.exploration import Exploration, Observation
 from imagine.train.baselines.parameters import Parameters
 from imagine.train.baselines.plan_state import PlanState, forget, plan_scratch, plan_state
 from imagine.train.baselines.planning import deal_worlds, fly_worlds, survey_worlds
-from imagine.core.frontier_targets import gain_rays
 from imagine.train.pilots import Actions
 
 Dealing = Literal["greedy", "hungarian"]

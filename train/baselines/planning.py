@@ -12,11 +12,11 @@ import numba
 import numpy as np
 
 from imagine.core.action import action_toward_kernel
+from imagine.core.dealing import coordinated_target
 from imagine.core.frontier import PAD, PLAN_CELL, UNIT_M
 from imagine.core.frontier_paths import FAR, FRONTIER
-from imagine.core.dealing import coordinated_target
-from imagine.core.frontier_ways import follow, trace_back
 from imagine.core.frontier_targets import distance_m, expected_gain, fill_ways, find_targets, nearest_open
+from imagine.core.frontier_ways import follow, trace_back
 
 _OWN_RINGS, _PEER_RINGS = 4, 12
 _STRAYED_CELLS = 3.0
