@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from imagine.core.frontier import FREE, OCCUPIED, PAD, UNKNOWN, FrontierField
-from imagine.core.frontier_paths import BLOCKED, FAR
+from imagine.core.frontier_paths import BLOCKED, FAR, FRONTIER, NEAR, OPEN
 
 _EDGES = ((1, 0, 5), (-1, 0, 5), (0, 1, 5), (0, -1, 5), (1, 1, 7), (-1, -1, 7), (1, -1, 7), (-1, 1, 7))
 """Steps (row, column, length in UNIT_M): a planning cell's 0.2 m, and its diagonal. Opposites stand in pairs."""
