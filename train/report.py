@@ -25,7 +25,7 @@ _MOST_LEVELS = 10  # lines of a screen of 24 that are left beside progress and l
 _MOST_NUMBERS = 12
 _FIRST_NUMBERS = (
     "policy_loss", "value_loss", "loss", "kl", "entropy", "clipped_share", "explained_variance", "actor_lr",
-    "return_mean", "reward",
+    "return", "reward",
 )  # fmt: skip
 """Numbers that say most, shown first where there are too many for a screen."""
 

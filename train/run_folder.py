@@ -54,7 +54,7 @@ class RunFolder:
         record = run_record(settings) | session_record() | {"changes": _keep_changes(path / "changes.patch")}
         _write(path / "record.json", json.dumps(record, indent=2) + "\n")
         trackers = open_trackers(settings.tracking, path, settings.run.name)
-        trackers.config(config)
+        trackers.config(config | {"run": {key: value for key, value in config["run"].items() if key != "root"}})
         return RunFolder(path, trackers)
 
     @staticmethod
