@@ -76,7 +76,7 @@ class Report:
         scalars.update({f"paradigm/{self.paradigm}/{name}": value for name, value in self.overall.items()})
         for drone, numbers in self.drones.items():
             scalars.update({f"drone/{drone}/{name}": value for name, value in numbers.items()})
-        scalars["progress/phase_share"] = self.phase_steps / max(1, self.phase_total)
+        scalars["progress/phase_share"] = min(1.0, self.phase_steps / max(1, self.phase_total))
         scalars["time/wall_s"] = self.wall_s
         scalars["speed/agent_steps_per_s"] = self.steps_per_s
         scalars.update({f"speed/{name}_s": value for name, value in self.seconds.items()})

@@ -61,7 +61,9 @@ def shown_command(arguments: Sequence[str]) -> list[str]:
         inside = path.is_relative_to(Path.cwd())
         return f"{key}{equals}{path.relative_to(Path.cwd()) if inside else path.name}"
 
-    return [Path(arguments[0]).name, *(shown(text) for text in arguments[1:])]
+    program = Path(arguments[0])
+    name = program.parent.name if program.name == "__main__.py" else program.name  # of python -m
+    return [name, *(shown(text) for text in arguments[1:])]
 
 
 def config_hash(settings: TrainSettings) -> str:

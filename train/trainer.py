@@ -248,7 +248,7 @@ class Trainer:
             },
             rngs={"torch": learner.generator.get_state(), "numpy": learner.rng.bit_generator.state},
             env=self.env.state_dict(),
-            record={**run_record(self.settings), "levels": self.episodes.means()},
+            record={**run_record(self.settings), "levels": self.episodes.summary()},
         )
 
     def _evaluate(self, checkpoint: Path) -> None:

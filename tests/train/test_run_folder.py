@@ -79,6 +79,7 @@ def test_the_command_is_shown_without_where_it_ran(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     given = ["/opt/bin/imagine", "train", f"{tmp_path}/mine.yaml", "--set", "run.root=/data/me/runs", "--set", "a=1=2"]
     assert shown_command(given) == ["imagine", "train", "mine.yaml", "--set", "run.root=runs", "--set", "a=1=2"]
+    assert shown_command(["/somewhere/imagine/__main__.py", "train"]) == ["imagine", "train"]
     assert shown_command(["imagine", "--resume=~/runs/a"]) == ["imagine", "--resume=a"]
 
 

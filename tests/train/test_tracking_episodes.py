@@ -64,6 +64,7 @@ def test_only_the_newest_episodes_count(episodes):
     recent.add(replace(episodes[0], coverage=k / 1000) for k in range(RECENT_EPISODES + 30))
     newest = np.arange(30, RECENT_EPISODES + 30) / 1000
     assert recent.means()["1"]["coverage"] == pytest.approx(newest.mean())
+    assert recent.summary()["1"] == {"coverage": pytest.approx(newest.mean()), "t90": TICKS, "contacts": 0.0}
 
 
 def test_ratios_are_averaged_as_ratios(episodes):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 Curves = Mapping[str, NDArray[np.float64]]
 
 _COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#8e5aa8", "#c28f1c", "#4aa3a2", "#a83f6a", "#6b6b6b")
+_TITLE_ROOM = 75  # letters above a panel
 _SMOOTH_SHARE = 0.02  # of the run's updates; the raw numbers stay visible behind
 
 
@@ -45,23 +46,26 @@ def plot_run(run_folder: Path, png: Path) -> None:
 
     levels = levels_of(curves)
     _draw(coverage, x, {level: curves[f"episode/{level}/coverage"] for level in levels}, smooth=False)
-    _finish(coverage, "coverage by level", levels_legend=True)
+    _finish(coverage, "coverage by level", legend=True)
     _draw(t90, x, {level: curves[f"episode/{level}/t90"] for level in levels}, smooth=False)
-    _finish(t90, "ticks to 90 % by level", levels_legend=False)
+    _finish(t90, "ticks to 90 % by level", legend=False)
     _draw(losses, x, _named(curves, {"imitation/loss": "imitation", "ppo/value_loss": "value"}))
     _positive_log(losses)
-    twin = losses.twinx()
-    _draw(twin, x, _named(curves, {"ppo/policy_loss": "policy (right)"}), first=2)
-    twin.spines[["top", "left"]].set_visible(False)
-    _finish(losses, "losses", also=twin)
-    _draw(divergence, x, _named(curves, {"ppo/kl": "KL divergence", "ppo/clipped_share": "clipped share"}))
-    _finish(divergence, "how far the policy moves in an update")
+    policy = _right_of(losses)
+    _draw(policy, x, _named(curves, {"ppo/policy_loss": "policy (right)"}), first=2)
+    _finish(losses, "losses", also=policy)
+    _draw(divergence, x, _named(curves, {"ppo/kl": "KL divergence"}))
+    clipped = _right_of(divergence)
+    _draw(clipped, x, _named(curves, {"ppo/clipped_share": "clipped share (right)"}), first=1)
+    for side in (divergence, clipped):
+        side.set_ylim(bottom=0.0)
+    _finish(divergence, "moves of the policy", also=clipped)
     _draw(explained, x, _named(curves, {"ppo/explained_variance": "explained variance"}))
     explained.axhline(1.0, color="#cccccc", lw=0.8, zorder=0)
     values = curves.get("ppo/explained_variance", np.empty(0))
     if np.isfinite(values).any():  # the first values of a fresh critic would flatten all that follow
         explained.set_ylim(max(-1.0, float(np.nanmin(values))) - 0.05, 1.05)
-    _finish(explained, "how well values foretell returns")
+    _finish(explained, "foresight of the values")
     _draw(speed, x, _named(curves, {"speed/agent_steps_per_s": "agent-steps a second"}))
     speed.set_ylim(bottom=0.0)
     _finish(speed, "speed")
@@ -143,7 +147,7 @@ def _positive_log(axes: Axes) -> None:
         axes.set_yscale("log")
 
 
-def _finish(axes: Axes, title: str, levels_legend: bool | None = None, also: Axes | None = None) -> None:
+def _finish(axes: Axes, title: str, legend: bool = True, also: Axes | None = None) -> None:
     axes.set_title(title, loc="left", fontsize=10)
     axes.grid(True, which="major", color="#e6e6e6", lw=0.8)
     axes.set_axisbelow(True)
@@ -154,6 +158,17 @@ def _finish(axes: Axes, title: str, levels_legend: bool | None = None, also: Axe
         handles, labels = handles + more_handles, labels + more_labels
     if not handles:
         axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", color="#999999")
-    elif levels_legend is not False:
-        columns = 1 if len(handles) < 5 else 4
-        axes.legend(handles, labels, frameon=False, fontsize=8, ncols=columns)
+    elif legend and sum(len(label) + 5 for label in labels) < _TITLE_ROOM - len(title):
+        axes.legend(  # beside the title, where it hides nothing
+            handles, labels, frameon=False, fontsize=8, ncols=len(handles), loc="lower right",
+            bbox_to_anchor=(1.02, 0.985), borderpad=0.1, handlelength=1.2, columnspacing=1.0, handletextpad=0.4,
+        )  # fmt: skip
+    elif legend:
+        axes.legend(handles, labels, fontsize=8, ncols=1 + len(handles) // 7, framealpha=0.7, edgecolor="none")
+
+
+def _right_of(axes: Axes) -> Axes:
+    """Return axes of their own scale, on the right, over the same horizontal one."""
+    right = axes.twinx()
+    right.spines[["top", "left"]].set_visible(False)
+    return right

@@ -119,6 +119,11 @@ class RecentEpisodes:
             means[group] = dict(zip(TEAM_METRICS, values.tolist(), strict=True))
         return means
 
+    def summary(self) -> Means:
+        """Return of `means` what says most: for records that travel with checkpoints and exported policies."""
+        names = ("coverage", "t90", "contacts")
+        return {group: {name: means[name] for name in names} for group, means in self.means().items()}
+
     def drone_means(self) -> Means:
         """Return the mean of every drone metric by drone, `"0"` the first; each group of levels counts alike."""
         if not self._counts:
