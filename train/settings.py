@@ -11,6 +11,7 @@ from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.imitation import ImitationSettings
 from imagine.train.networks import NetworkSettings
 from imagine.train.ppo import PpoSettings
+from imagine.train.tracking.settings import TrackingSettings
 
 CONFIGS = Path(__file__).parent / "configs"
 """Folder of the configurations that come with the package: `default.yaml`, `smoke.yaml`."""
@@ -29,13 +30,14 @@ class RunSettings(Settings):
 
 
 class TrainSettings(Settings):
-    """A training run: environment, networks, imitation, PPO."""
+    """A training run: environment, networks, imitation, PPO, tracking."""
 
     run: RunSettings = Field(default_factory=RunSettings)
     env: ExplorationSettings = Field(default_factory=ExplorationSettings)
     network: NetworkSettings = Field(default_factory=NetworkSettings)
     imitation: ImitationSettings = Field(default_factory=ImitationSettings)
     ppo: PpoSettings = Field(default_factory=PpoSettings)
+    tracking: TrackingSettings = Field(default_factory=TrackingSettings)
 
 
 def load_train_settings(config: Path | None, overrides: tuple[str, ...] = ()) -> TrainSettings:

@@ -67,7 +67,7 @@ def train(
     folder = (
         RunFolder.create(settings)
         if resume is None or checkpoint is None
-        else RunFolder.reopen(_run_path(resume), sum(checkpoint.agent_steps.values()))
+        else RunFolder.reopen(_run_path(resume), sum(checkpoint.agent_steps.values()), settings)
     )
     try:
         with stop_requests() as stop:
@@ -138,7 +138,7 @@ class Trainer:
         # Set here, whatever OMP_NUM_THREADS says: sums are split by thread, and equal settings must give equal runs.
         torch.set_num_threads(self.settings.run.threads or len(os.sched_getaffinity(0)))
         self.learner = Learner.create(self.settings)
-        self.episodes = RecentEpisodes(self.settings.env.episode_ticks)
+        self.episodes = RecentEpisodes(self.settings.env.episode_ticks, self.settings.env.levels)
         self._wall_before_s = 0.0
         if self.resumed is not None:
             self.learner.restore(self.resumed)
@@ -219,11 +219,12 @@ class Trainer:
             phase_total=total,
             numbers=numbers,
             levels=self.episodes.means(),
+            drones=self.episodes.drone_means(),
             steps_per_s=steps / sum(seconds.values()),
             seconds=seconds,
             wall_s=self._wall_s(),
         )
-        self._folder.log(report.agent_steps, report.scalars(), report.row())
+        self._folder.log(report.agent_steps, report.scalars())
         self._report(report)
         if time.monotonic() - self._saved >= self.settings.run.checkpoint_every_s:
             self._saved = time.monotonic()
@@ -247,7 +248,7 @@ class Trainer:
             },
             rngs={"torch": learner.generator.get_state(), "numpy": learner.rng.bit_generator.state},
             env=self.env.state_dict(),
-            record={**run_record(self.settings), "levels": self.episodes.means()},
+            record={**run_record(self.settings), "levels": self.episodes.summary()},
         )
 
     def _evaluate(self, checkpoint: Path) -> None:
