@@ -41,7 +41,7 @@ class TrainSettings(Settings):
 
 
 def load_train_settings(config: Path | None, overrides: tuple[str, ...] = ()) -> TrainSettings:
-    """Read a training configuration: a YAML file, the name of a packaged one (`default`, `curriculum`), or None (default).
+    """Read a training configuration: a YAML file, the name of a packaged one (`smoke`), or None (`default`).
 
     Raises InputError with file, line and key.
     """
