@@ -17,12 +17,11 @@ from imagine.mesh_comm.settings import Protocol
 from imagine.onboard.settings import DEFAULT_POLICY
 from imagine.outputs import write_json
 from imagine.sim.film import Film
+from imagine.sim.level_names import expand_level
 from imagine.train.atomic_file import write_atomically
 from imagine.train.evaluation import evaluate, named_policy
 from imagine.train.evaluation_env import evaluation_env
 
-_HOUSES = "house:"
-_MOST_LEVELS = 1000
 _SHOWN = {
     "level": "level", "drones": "drones", "coverage_mean": "seen", "t90_mean": "T90", "t90_reached": "T90\nreached",
     "t95_mean": "T95", "t99_mean": "T99", "collisions_per_episode": "contacts", "path_m": "path,\nm",
@@ -93,25 +92,13 @@ def _cell(value: object) -> str:
 def level_list(text: str) -> list[str]:
     """Return the levels of a list such as 4, 0-6 or 1,3,house.yaml; house:0-9 and house:0-9:120 are ten houses each.
 
-    Raises InputError on an empty range, and where a name is missing.
+    Raises InputError as `expand_level` does, and where a name is missing.
     """
     levels: list[str] = []
     for part in (part.strip() for part in text.split(",")):
         if not part:
             raise InputError(f"--levels {text!r}: a level is missing: give such as 4, 0-6 or 1,3,house.yaml")
-        prefix, seeds, area = "", part, ""
-        if part.startswith(_HOUSES):
-            prefix, (seeds, colon, size) = _HOUSES, part.removeprefix(_HOUSES).partition(":")
-            area = colon + size
-        first, dash, last = seeds.partition("-")
-        if dash and first.isdecimal() and last.isdecimal():
-            if int(last) < int(first):
-                raise InputError(f"--levels {part}: the range is empty; write {prefix}{last}-{first}{area}")
-            if int(last) - int(first) >= _MOST_LEVELS:
-                raise InputError(f"--levels {part}: more than {_MOST_LEVELS} levels; take a shorter range")
-            levels += [f"{prefix}{number}{area}" for number in range(int(first), int(last) + 1)]
-        else:
-            levels.append(part)
+        levels += expand_level(part, "--levels")
     return levels
 
 

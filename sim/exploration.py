@@ -27,10 +27,12 @@ from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.exploration_tick import FLYING, LAUNCHING, STAGES, WAITING, Specs, fly, locate, observe, scan, share
 from imagine.sim.keyed_noise import root_keys
 from imagine.sim.level import Level
+from imagine.sim.level_names import expand_levels
 from imagine.sim.level_variants import LevelVariants, level_shares
 from imagine.sim.metrics import EpisodeMetrics, EpisodeTotals, Recorder
 from imagine.sim.odometry_drift import OdometryDrift
 from imagine.sim.planner_actions import plan_worlds
+from imagine.sim.randomisation import draw
 from imagine.sim.reward import rewards, survivors, sweep_cells
 from imagine.sim.team_maps import Scratch, TeamMaps, derive
 from imagine.sim.twin import TICK_S, Twin
@@ -97,8 +99,9 @@ class Exploration:
         self.lidar = settings.lidar_spec
         keys = list(range(worlds)) if world_keys is None else list(world_keys)
         _check_seeds(seed, keys, worlds)
-        self._variants = LevelVariants(settings.levels, settings.mirror)
-        self._weights = level_shares(settings.level_weights, len(self._variants))
+        names, shares = expand_levels(settings.levels, settings.level_weights)
+        self._variants = LevelVariants(names, settings.mirror)
+        self._weights = np.array(shares)
         self._generators = [np.random.default_rng([seed, key]) for key in keys]
         rows, columns = self._variants.rows, self._variants.columns
         first = [self._draw_level(world) for world in range(worlds)]
@@ -144,12 +147,13 @@ class Exploration:
 
     @property
     def level_weights(self) -> NDArray[np.float64]:
-        """The share of coming episodes that each of `settings.levels` gets, `[levels]`."""
+        """The share of coming episodes of each level that `settings.levels` stand for, `[levels]`."""
         return self._weights.copy()
 
     def set_level_weights(self, weights: Sequence[float]) -> None:
-        """Draw the levels of all episodes that begin from now on by other weights, one for each of `settings.levels`.
+        """Draw the levels of all episodes that begin from now on by other weights, one for each level.
 
+        Ranges in `settings.levels` stand for many levels, see `sim/level_names.py`; they have a weight each here.
         Episodes in progress go on where they are. Raises InputError where a weight is negative or missing, or all are
         zero.
         """
@@ -172,7 +176,8 @@ class Exploration:
         self.twin.set_level(world, level, level.launch_poses(self.drones, generator))
         column0, row0, _, _ = level.grid
         self.maps.clear(world, level.coverable, (column0, row0))
-        self.air.clear(world)
+        draws = self._generators[world]
+        self.air.clear(world, self.settings.radio.drawn(draws), draw(self.settings.budget_bytes_per_s, draws))
         self.decisions.clear(world)
         self.ticks[world] = 0
         self._ended[world] = False
