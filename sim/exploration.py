@@ -32,6 +32,7 @@ from imagine.sim.level_variants import LevelVariants, level_shares
 from imagine.sim.metrics import EpisodeMetrics, EpisodeTotals, Recorder
 from imagine.sim.odometry_drift import OdometryDrift
 from imagine.sim.planner_actions import plan_worlds
+from imagine.sim.randomisation import draw
 from imagine.sim.reward import rewards, survivors, sweep_cells
 from imagine.sim.team_maps import Scratch, TeamMaps, derive
 from imagine.sim.twin import TICK_S, Twin
@@ -177,7 +178,8 @@ class Exploration:
         column0, row0, _, _ = level.grid
         self.maps.clear(world, level.coverable, (column0, row0))
         self._critic.clear(world)
-        self.air.clear(world)
+        draws = self._generators[world]
+        self.air.clear(world, self.settings.radio.drawn(draws), draw(self.settings.budget_bytes_per_s, draws))
         self.decisions.clear(world)
         self.ticks[world] = 0
         self._ended[world] = False

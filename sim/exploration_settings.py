@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 from pydantic import Field, field_validator
 
@@ -19,6 +20,7 @@ from imagine.sim.level_names import expand_level
 from imagine.sim.lidar_model import LidarModel
 from imagine.sim.odometry_drift import DriftSettings
 from imagine.sim.radio import RadioSettings
+from imagine.sim.randomisation import Quantity, ends, positive
 from imagine.sim.reward import RewardSettings
 
 
@@ -48,8 +50,8 @@ class ExplorationSettings(Settings):
     observation: ObservationSpec = ObservationSpec()
     action: ActionSpec = ActionSpec()
     protocol: Protocol = "one-hop"
-    budget_bytes_per_s: float = Field(
-        default=MeshSettings().rate_bytes_per_s, gt=0.0, description="bytes a second that a drone may send, sealed"
+    budget_bytes_per_s: Annotated[Quantity, positive()] = Field(
+        default=MeshSettings().rate_bytes_per_s, description="bytes a second that a drone may send, sealed"
     )
     radio: RadioSettings = RadioSettings()
     reward: RewardSettings = RewardSettings()
@@ -82,5 +84,5 @@ class ExplorationSettings(Settings):
 
     @property
     def mesh(self) -> MeshSettings:
-        """How the drones use their radios."""
-        return MeshSettings(protocol=self.protocol, rate_bytes_per_s=self.budget_bytes_per_s)
+        """How the drones use their radios, with the largest budget that an episode may have."""
+        return MeshSettings(protocol=self.protocol, rate_bytes_per_s=ends(self.budget_bytes_per_s)[1])

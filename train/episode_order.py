@@ -52,7 +52,7 @@ class EpisodeOrder:
         if not self._clocks:
             return []
         oldest = max(self._clocks.values()) - 2 * self.episode_ticks
-        if len(self._clocks) < self.worlds and oldest < 0:
+        if len(self._clocks) < self.worlds and oldest <= 0:
             return []  # a world that has not told of any episode yet flies its first
         running = min((clock, stream) for stream, clock in self._clocks.items() if clock >= oldest)
         ready = []

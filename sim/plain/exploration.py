@@ -263,10 +263,14 @@ def means(variant: Variant) -> Means:
 
 
 def _check(settings: ExplorationSettings) -> None:
+    radio = settings.radio
     lacking = {
         "dynamics": settings.dynamics != DynamicsSettings(),
         "sensing": settings.sensing != LidarModel(),
         "drift": settings.drift.enabled,
+        "ranges of radio or budget": any(
+            isinstance(value, tuple) for value in (radio.range_m, radio.tx_dbm, radio.loss, settings.budget_bytes_per_s)
+        ),
         "observation: position, heading, peers, visits": settings.observation.version != 1,
     }
     for name, is_asked_for in lacking.items():
