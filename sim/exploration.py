@@ -21,7 +21,7 @@ from imagine.core.raster import TILE
 from imagine.sim.action_values import action_values
 from imagine.sim.air import Air
 from imagine.sim.air_receive import claim_own
-from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
+from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, CriticImages
 from imagine.sim.decision_state import DecisionState
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.exploration_tick import FLYING, LAUNCHING, STAGES, WAITING, Specs, fly, locate, observe, scan, share
@@ -113,6 +113,7 @@ class Exploration:
             worlds, drones, rows // TILE, columns // TILE, settings.radio, settings.mesh, self.lidar, cap, TICK_S
         )
         self.decisions = DecisionState(worlds, drones, rows, columns, settings.observation, settings.action, workers)
+        self._critic = CriticImages(self.maps.arrays, workers)
         self._recorder = Recorder(worlds, drones, seed)
         self.ticks = np.zeros(worlds, np.int64)
         self._ended = np.zeros(worlds, bool)  # and not started anew
@@ -176,6 +177,7 @@ class Exploration:
         self.twin.set_level(world, level, level.launch_poses(self.drones, generator))
         column0, row0, _, _ = level.grid
         self.maps.clear(world, level.coverable, (column0, row0))
+        self._critic.clear(world)
         draws = self._generators[world]
         self.air.clear(world, self.settings.radio.drawn(draws), draw(self.settings.budget_bytes_per_s, draws))
         self.decisions.clear(world)
@@ -339,14 +341,12 @@ class Exploration:
     def _observation(self) -> Observation:
         return Observation(self._observed[self._now], self)
 
-    def critic_images(self) -> NDArray[np.float32]:
-        """Return what a centralised critic sees of every drone's world, float32 `[worlds, drones, channels, n, n]`."""
-        critic = np.zeros((self.worlds, self.drones, CRITIC_CHANNELS, CRITIC_CELLS, CRITIC_CELLS), np.float32)
-        maps = self.maps
-        self.twin.workers.over(
-            self.worlds, fill_critic, critic, maps.seen, maps.coverable, maps.origins, self.twin.poses
-        )
-        return critic
+    def critic_images(self, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+        """Return what a centralised critic sees of every drone's world, float32 `[worlds, drones, channels, n, n]`.
+
+        With `out`, contiguous and of that shape or `[worlds * drones, channels, n, n]`, they are written there.
+        """
+        return self._critic.fill(self.twin.poses, out)
 
     def planner_actions(self) -> NDArray[np.float32]:
         """Return the frontier planner's action for every drone, nan where it is dead or sees no frontier to go to."""

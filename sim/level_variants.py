@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from imagine.core.errors import InputError
 from imagine.sim.level import Level, load_level, mirrored
 
-_MIRRORS = tuple(itertools.product((False, True), repeat=3))
+_FLAGS = (False, True)
+_MIRRORS = tuple(itertools.product(_FLAGS, _FLAGS, _FLAGS))
 """Axes swapped, turned round along x, along y; the first is the level as it is."""
 _KEPT = 512
 """Mirrored levels that are kept with what was found out about them, about 0.2 MB each; others are made again."""
