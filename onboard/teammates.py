@@ -21,7 +21,7 @@ def peer_poses(mesh: MeshNode | None, now: float) -> tuple[PeerPoses, PeerPoses]
     """
     if mesh is None or mesh.settings.protocol == "off":
         return PeerPoses.none(), PeerPoses.none()
-    told = [peer for peer in mesh.peers(now).values() if peer.id != GROUND]
+    told = [peer for _, peer in sorted(mesh.peers(now).items()) if peer.id != GROUND]  # as the twin numbers them
     return _of(told), _of([peer for peer in told if peer.status is not None and peer.status.ladder in _EXPLORING])
 
 

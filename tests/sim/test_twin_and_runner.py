@@ -26,7 +26,8 @@ FALLS_AT = 110
 
 
 EVERYTHING: dict[str, Any] = {
-    "position": True, "heading": True, "peers": 2, "visits": "team", "visits_full_ticks": 20,
+    "position": True, "heading": True, "peers": 2, "peer_places": 2, "frontiers": 4, "visits": "team",
+    "visits_full_ticks": 20,
 }  # fmt: skip
 
 
