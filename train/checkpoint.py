@@ -84,7 +84,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 def load_weights(network: nn.Module, weights: dict[str, Tensor], where: str) -> None:
     """Put a checkpoint's weights into a network. Raises InputError naming the first tensor that does not fit."""
     own = network.state_dict()
-    for name in own.keys() | weights.keys():
+    for name in dict.fromkeys((*own, *weights)):
         if name not in weights:
             raise InputError(f"{where}: made for another network: it has no '{name}'")
         if name not in own:
@@ -93,6 +93,22 @@ def load_weights(network: nn.Module, weights: dict[str, Tensor], where: str) -> 
             has, needs = tuple(weights[name].shape), tuple(own[name].shape)
             raise InputError(f"{where}: made for another network: '{name}' is {has}, this one needs {needs}")
     network.load_state_dict(weights)
+
+
+def check_same_network(checkpoint: Checkpoint, settings: TrainSettings, where: str) -> None:
+    """Raise InputError naming the first setting of the networks in which a checkpoint differs from a run."""
+    for group, saved, wanted in (
+        ("network", checkpoint.settings.network, settings.network),
+        ("env.observation", checkpoint.settings.env.observation, settings.env.observation),
+        ("env.action", checkpoint.settings.env.action, settings.env.action),
+    ):
+        for name in type(saved).model_fields:
+            has, needs = getattr(saved, name), getattr(wanted, name)
+            if has != needs and name != "log_std":  # that one is where learning began
+                raise InputError(
+                    f"{where}: made for another network: {group}.{name} is {has} in it, {needs} here; "
+                    "leave the setting as it was, or train anew"
+                )
 
 
 def actor_of(checkpoint: Checkpoint, where: str) -> Actor:

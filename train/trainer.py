@@ -21,14 +21,14 @@ import torch
 from imagine.core.errors import InputError
 from imagine.sim.exploration import Exploration
 from imagine.train.atomic_file import write_atomically
-from imagine.train.checkpoint import Checkpoint, Phase, load_checkpoint, load_weights
+from imagine.train.checkpoint import Checkpoint, Phase, check_same_network, load_checkpoint, load_weights
 from imagine.train.evaluation import evaluate
-from imagine.train.imitation import LabelBuffer, collect_labels, learn
+from imagine.train.imitation import collect_labels, label_buffer, learn
 from imagine.train.networks import Actor, Critic
 from imagine.train.policies import policy_of
 from imagine.train.ppo import Optimisers, update
 from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
-from imagine.train.rollout import collect
+from imagine.train.rollout import Recall, collect
 from imagine.train.run_folder import RunFolder, run_record
 from imagine.train.settings import TrainSettings, load_train_settings
 
@@ -140,7 +140,9 @@ class Trainer:
         self.learner = Learner.create(self.settings)
         self.episodes = RecentEpisodes(self.settings.env.episode_ticks)
         self._wall_before_s = 0.0
+        self._recall = Recall.nothing(self.learner.actor, self.env.worlds * self.env.drones)
         if self.resumed is not None:
+            check_same_network(self.resumed, self.settings, "checkpoint")
             self.learner.restore(self.resumed)
             self.agent_steps = dict(self.resumed.agent_steps)
             self.updates, self.phase = self.resumed.updates, self.resumed.phase
@@ -163,7 +165,7 @@ class Trainer:
     def _imitate(self) -> None:
         """Let the student fly and learn from the planner's labels, round after round."""
         settings, learner = self.settings.imitation, self.learner
-        buffer = LabelBuffer(settings.buffer_samples)
+        buffer = label_buffer(learner.actor, settings.buffer_samples)
         while self.agent_steps["imitation"] < settings.agent_steps and not self._stop.is_set():
             done_share = self.agent_steps["imitation"] / settings.agent_steps
             began = time.monotonic()
@@ -171,7 +173,7 @@ class Trainer:
             planner_share = settings.planner_share * max(0.0, 1.0 - done_share / until)
             self._observation, episodes, labels = collect_labels(
                 self.env, self._observation, learner.actor, buffer, settings.round_steps, planner_share,
-                learner.rng, learner.generator,
+                learner.rng, learner.generator, settings.precision, self._recall,
             )  # fmt: skip
             collected = time.monotonic()
             for group in learner.imitation.param_groups:
@@ -192,7 +194,7 @@ class Trainer:
             began = time.monotonic()
             rollout, self._observation = collect(
                 self.env, self._observation, learner.actor, settings.rollout_steps, learner.generator,
-                settings.precision,
+                settings.precision, self._recall, settings.sequence_steps,
             )  # fmt: skip
             collected = time.monotonic()
             numbers = update(

@@ -6,10 +6,11 @@ from imagine.core.errors import WorkError
 from imagine.core.observation_spec import ObservationSpec
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
-from imagine.train.imitation import ImitationSettings, LabelBuffer, collect_labels, imitation_loss, learn
+from imagine.train.imitation import ImitationSettings, collect_labels, imitation_loss, learn
+from imagine.train.labels import LabelBuffer
 from imagine.train.networks import Actor, Critic, NetworkSettings, log_probability
 from imagine.train.ppo import Optimisers, PpoSettings, update
-from imagine.train.rollout import OBSERVATION_KEYS, Rollout, actor_inputs, collect
+from imagine.train.rollout import OBSERVATION_KEYS, Rollout, collect
 
 SPEC = ObservationSpec(view_cells=16, lidar_sectors=16)
 SMALL = NetworkSettings(view_channels=(8, 8, 8), critic_channels=(8, 8), lidar_channels=4, hidden=32)
@@ -96,11 +97,11 @@ def test_imitation_comes_close_to_the_planner():
     rng = np.random.default_rng(0)
     _, _, added = collect_labels(env, env.reset(), actor, buffer, 60, 0.5, rng, generator)
     assert added == len(buffer) > 300
-    tensors, labels = buffer.sample(256, generator)
-    before = imitation_loss(actor(*actor_inputs(tensors)), labels, 0.25).item()
+    batch = buffer.sample(256, generator)
+    before = imitation_loss(batch.decide(actor).mean, batch["labels"], 0.25).item()
     optimiser = torch.optim.Adam(actor.parameters(), lr=settings.lr)
     learn(actor, optimiser, buffer, settings, generator)
-    after = imitation_loss(actor(*actor_inputs(tensors)), labels, 0.25).item()
+    after = imitation_loss(batch.decide(actor).mean, batch["labels"], 0.25).item()
     assert after < 0.3 * before
 
 
@@ -110,9 +111,9 @@ def test_the_buffer_keeps_the_newest_labels():
         numbers = torch.arange(first, first + 4.0)[:, None]
         buffer.add({"motion": numbers.repeat(1, 3)}, numbers.repeat(1, 2))
     assert len(buffer) == 10
-    tensors, labels = buffer.sample(500, torch.Generator().manual_seed(0))
-    assert set(labels[:, 0].tolist()) == set(range(14, 24))
-    assert torch.equal(tensors["motion"][:, 0], labels[:, 0])
+    batch = buffer.sample(500, torch.Generator().manual_seed(0))
+    assert set(batch["labels"][:, 0].tolist()) == set(range(14, 24))
+    assert torch.equal(batch["motion"][:, 0], batch["labels"][:, 0])
 
 
 def test_a_rollout_holds_what_was_seen_done_and_earned():
