@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from imagine.core.config import Settings, check_settings
 from imagine.core.errors import InputError
@@ -20,6 +20,13 @@ from imagine.core.vehicle_limits import VehicleLimits
 
 CONTRACT_KEY = "imagine.contract"
 """Key of the contract among the ONNX file's metadata properties."""
+STATE, NEXT_STATE = "state", "next_state"
+"""Names of the input and the output by which a model remembers, `[batch, state_size]`."""
+LEVEL = "level"
+"""Name of the input that shows a centralised policy the whole level, `[batch, *level_shape]`."""
+
+Paradigm = Literal["ctde", "dtde", "ctce"]
+"""Who sees what: centralised (C) or decentralised (D) training (T) and execution (E)."""
 
 
 class ActionSpec(Settings):
@@ -77,9 +84,14 @@ class LidarContract(Settings):
 
 
 class PolicyContract(Settings):
-    """Everything a runner must match to fly a model as it was trained."""
+    """Everything a runner must match to fly a model as it was trained.
 
-    contract_version: Literal[1] = 1
+    A model that remembers takes `state`, zero where a flight begins, and gives `next_state` for its next decision. One
+    of the paradigm `ctce` decides for a whole team at once, by what all its drones see and by the whole level: its
+    batch is the team, and no drone can fly it. Both are of version 2.
+    """
+
+    contract_version: Literal[1, 2] = Field(default=1, description="2 with a state or for ctce; may be left out")
     name: str = Field(min_length=1, max_length=100)
     observation: ObservationSpec
     action: ActionSpec
@@ -87,8 +99,36 @@ class PolicyContract(Settings):
     lidar: LidarContract
     map: MapSettings
     limits: VehicleLimits
+    paradigm: Paradigm = "ctde"
+    state_size: int = Field(default=0, ge=0, le=10_000_000, description="numbers the model remembers; 0: none")
+    level_shape: tuple[int, int, int] | None = Field(default=None, description="of the level's image, for ctce")
     training: dict[str, Any] = Field(default_factory=dict, description="run, config, steps and result, for the record")
     weights_sha256: str = Field(default="", description="hash of the model's initialisers, in order of name")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _version_of_its_needs(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "contract_version" not in data:
+            return {**data, "contract_version": 2 if data.get("state_size") or data.get("paradigm") == "ctce" else 1}
+        return data
+
+    @model_validator(mode="after")
+    def _needs_fit(self) -> Self:
+        if self.contract_version == 1 and (self.state_size or self.paradigm == "ctce"):
+            raise ValueError("version 1 knows neither a state nor ctce: say contract_version 2, or leave it out")
+        if (self.paradigm == "ctce") != (self.level_shape is not None):
+            raise ValueError("level_shape is for the paradigm ctce, which needs it")
+        return self
+
+    @property
+    def inputs(self) -> dict[str, tuple[int, ...]]:
+        """Shape of each input of the model, by name, without the batch axis."""
+        shapes = dict(self.observation.shapes)
+        if self.level_shape is not None:
+            shapes[LEVEL] = self.level_shape
+        if self.state_size:
+            shapes[STATE] = (self.state_size,)
+        return shapes
 
     def to_json(self) -> str:
         """Return the contract as the JSON text that the ONNX file carries."""

@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 import imagine.train  # noqa: F401  sets up OpenMP before torch works
 from imagine.core.contract import CONTRACT_KEY, LidarContract, PolicyContract
 from imagine.core.errors import InputError, WorkError
-from imagine.core.observation_spec import ObservationSpec
 from imagine.onboard.onnx_weights import hash_weights
-from imagine.onboard.policy import OUTPUT, OnnxPolicy
+from imagine.onboard.policy import OnnxPolicy
 from imagine.train.atomic_file import write_atomically
 from imagine.train.checkpoint import Checkpoint, actor_of, load_checkpoint
-from imagine.train.networks import Actor
-from imagine.train.rollout import OBSERVATION_KEYS
+from imagine.train.networks import LEVEL_CELLS, LEVEL_CHANNELS, Actor
 from imagine.train.run_folder import config_hash
 
 logger = logging.getLogger(__name__)
@@ -51,13 +49,15 @@ def export_onnx(checkpoint: Path, out: Path, name: str | None = None) -> Inspect
     """Write a checkpoint's deterministic policy to `out` and return what `inspect` finds in it.
 
     `checkpoint` is a `.pt` file or a run folder; `name` goes into the contract (default: the run's name). The model
-    takes `views`, `lidar` and `motion` with any batch size and returns `action` `[batch, action size]`. Raises
-    InputError for a bad checkpoint, WorkError when the model does not agree with the network or cannot be written.
+    takes `views`, `lidar` and `motion` with any batch size and returns `action` `[batch, action size]`; one that
+    remembers also takes `state` and returns `next_state`, a centralised one also takes `level`, and its batch is a
+    team. Raises InputError for a bad checkpoint, WorkError when the model does not agree with the network or cannot be
+    written.
     """
     saved = load_checkpoint(checkpoint)
     actor = actor_of(saved, str(checkpoint))
-    model = _to_onnx(actor, saved.settings.env.observation)
-    difference = parity(actor, model, saved.settings.env.observation)
+    model = _to_onnx(actor)
+    difference = parity(actor, model)
     if not difference <= PARITY_TOLERANCE:
         raise WorkError(
             f"{checkpoint}: ONNX and torch differ by {difference:.2g}, at most {PARITY_TOLERANCE:g} allowed"
@@ -65,15 +65,15 @@ def export_onnx(checkpoint: Path, out: Path, name: str | None = None) -> Inspect
     logger.info("ONNX and torch differ by at most %.2g on %d observations", difference, PARITY_OBSERVATIONS)
 
     record = {**_training_record(saved, checkpoint), "parity_max_difference": difference}
-    contract = _contract(saved, name or saved.settings.run.name, record, hash_weights(model, str(out)))
+    contract = _contract(saved, actor, name or saved.settings.run.name, record, hash_weights(model, str(out)))
     content = _with_contract(model, contract)
     write_atomically(out, lambda temporary: temporary.write_bytes(content))
     return inspect(out)
 
 
-def _to_onnx(actor: Actor, spec: ObservationSpec) -> bytes:
+def _to_onnx(actor: Actor) -> bytes:
     """Return the actor as a serialised ONNX model."""
-    example = tuple(torch.zeros((2, *spec.shapes[key])) for key in _keys(spec))
+    example = tuple(torch.zeros((3, *shape)) for shape in actor.shapes.values())
     batch = torch.export.Dim("batch")
     quiet = logging.getLogger("torch.onnx")
     level = quiet.level
@@ -84,9 +84,9 @@ def _to_onnx(actor: Actor, spec: ObservationSpec) -> bytes:
             program = torch.onnx.export(
                 actor,
                 example,
-                input_names=_keys(spec),
-                output_names=[OUTPUT],
-                dynamic_shapes=tuple({0: batch} for _ in example),
+                input_names=list(actor.inputs),
+                output_names=list(actor.outputs),
+                dynamic_shapes=(tuple({0: batch} for _ in example),),
                 opset_version=_OPSET,
                 dynamo=True,
                 verbose=False,
@@ -103,31 +103,34 @@ def _to_onnx(actor: Actor, spec: ObservationSpec) -> bytes:
     return content
 
 
-def _keys(spec: ObservationSpec) -> list[str]:
-    """Return the names of the actor's inputs in the order of its `forward`."""
-    return [key for key in OBSERVATION_KEYS if key in spec.shapes]
+def parity(actor: Actor, model: bytes, observations: int = PARITY_OBSERVATIONS) -> float:
+    """Return the largest difference between ONNX and torch over random observations, one batch and in small ones.
 
-
-def parity(actor: Actor, model: bytes, spec: ObservationSpec, observations: int = PARITY_OBSERVATIONS) -> float:
-    """Return the largest difference between ONNX and torch over random observations, one batch and one by one."""
+    States are random too, so that what is remembered counts; they are in [-1, 1], as a memory's are.
+    """
     rng = np.random.default_rng(0)
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     inputs: dict[str, NDArray[np.float32]] = {
-        key: rng.uniform(-1.0, 1.0, (observations, *spec.shapes[key])).astype(np.float32) for key in _keys(spec)
+        key: rng.uniform(-1.0, 1.0, (observations, *shape)).astype(np.float32) for key, shape in actor.shapes.items()
     }
     inputs["lidar"] = np.abs(inputs["lidar"])
-    with torch.no_grad():
-        expected = actor(*(torch.from_numpy(inputs[key]) for key in _keys(spec))).numpy()
-    batched = session.run([OUTPUT], inputs)[0]
-    single = np.concatenate(
-        [session.run([OUTPUT], {key: value[i : i + 1] for key, value in inputs.items()})[0] for i in range(16)]
-    )
-    if batched.shape != expected.shape or not np.isfinite(batched).all():
-        return math.inf
-    return float(max(np.abs(batched - expected).max(), np.abs(single - expected[:16]).max()))
+    worst = 0.0
+    for rows in (slice(0, observations), *(slice(i, i + 1) for i in range(16)), slice(16, 19)):
+        part = {key: value[rows] for key, value in inputs.items()}
+        with torch.no_grad():
+            given = actor(*(torch.from_numpy(part[key]) for key in actor.inputs))
+        expected = given if isinstance(given, tuple) else (given,)
+        found = session.run(list(actor.outputs), part)
+        for one, other in zip(found, expected, strict=True):
+            if one.shape != tuple(other.shape) or not np.isfinite(one).all():
+                return math.inf
+            worst = max(worst, float(np.abs(one - other.numpy()).max()))
+    return worst
 
 
-def _contract(saved: Checkpoint, name: str, record: dict[str, Any], weights_sha256: str) -> PolicyContract:
+def _contract(
+    saved: Checkpoint, actor: Actor, name: str, record: dict[str, Any], weights_sha256: str
+) -> PolicyContract:
     env = saved.settings.env
     lidar = env.lidar_spec
     return PolicyContract(
@@ -138,6 +141,9 @@ def _contract(saved: Checkpoint, name: str, record: dict[str, Any], weights_sha2
         lidar=LidarContract.of(lidar),
         map=env.map,
         limits=env.limits,
+        paradigm=actor.paradigm,
+        state_size=actor.state_size,
+        level_shape=(LEVEL_CHANNELS, LEVEL_CELLS, LEVEL_CELLS) if actor.is_central else None,
         training=record,
         weights_sha256=weights_sha256,
     )

@@ -96,7 +96,7 @@ def _rehearse_flight(settings: DroneSettings, policy: Policy | None, scan: Scan,
     visits.count(pose.x, pose.y, mates)
     observation = observe(spec, belief, field, origin, pose, (0.0, 0.0), 0.0, scan, lidar, mates, visits)
     if policy is not None:
-        policy.infer(observation)
+        policy.infer(observation, np.zeros(policy.contract.state_size, np.float32))
 
 
 def square_room(spec: LidarSpec, half_side_m: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.contract import CONTRACT_KEY, PolicyContract
+from imagine.core.contract import CONTRACT_KEY, NEXT_STATE, STATE, PolicyContract
 from imagine.core.errors import InputError, WorkError
 from imagine.core.lidar import LidarSpec
 from imagine.core.mapping import MapSettings
@@ -28,12 +28,18 @@ _TOLERANCE = 1e-6
 
 
 class Policy(Protocol):
-    """What the runner needs of a policy: its contract, and an action for an observation."""
+    """What the runner needs of a policy: its contract, and an action for an observation and what it remembers."""
 
     contract: PolicyContract
 
-    def infer(self, observation: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-        """Return the action, float32 `[contract.action.size]`. Raises WorkError where the model fails."""
+    def infer(
+        self, observation: dict[str, NDArray[np.float32]], state: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the action, float32 `[contract.action.size]`, and the next state, `[contract.state_size]`.
+
+        `state` is what it returned for the decision before, zeros where a flight begins. Raises WorkError where the
+        model fails.
+        """
 
 
 class OnnxPolicy:
@@ -59,16 +65,23 @@ class OnnxPolicy:
                 )
         return OnnxPolicy(contract, session)
 
-    def infer(self, observation: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-        """Return the action of one observation (arrays without batch axis), float32 `[action size]`."""
+    def infer(
+        self, observation: dict[str, NDArray[np.float32]], state: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return action and next state of one observation (arrays without batch axis), see `Policy.infer`."""
         from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
 
         batch = {name: array[np.newaxis] for name, array in observation.items()}
+        outputs = [OUTPUT]
+        if self.contract.state_size:
+            batch[STATE] = state[np.newaxis]
+            outputs.append(NEXT_STATE)
         try:
-            (action,) = self._session.run([OUTPUT], batch)
+            action, *rest = self._session.run(outputs, batch)
         except (ort_state.Fail, ort_state.RuntimeException, ort_state.InvalidArgument, ort_state.EPFail) as error:
             raise WorkError(f"policy inference failed: {_first_line(error)}") from error
-        return np.asarray(action[0], dtype=np.float32)
+        following = rest[0][0] if rest else state
+        return np.asarray(action[0], dtype=np.float32), np.asarray(following, dtype=np.float32)
 
 
 def read_contract(session: Any, where: str) -> PolicyContract:
@@ -80,7 +93,7 @@ def read_contract(session: Any, where: str) -> PolicyContract:
         )
     contract = PolicyContract.from_json(text, where)
     inputs = {node.name: node for node in session.get_inputs()}
-    shapes = contract.observation.shapes
+    shapes = contract.inputs
     if set(inputs) != set(shapes):
         raise InputError(f"{where}: contract: observation has inputs {sorted(shapes)}, the graph has {sorted(inputs)}")
     for name, shape in shapes.items():
@@ -89,6 +102,10 @@ def read_contract(session: Any, where: str) -> PolicyContract:
     if OUTPUT not in outputs:
         raise InputError(f"{where}: contract: the graph has no output '{OUTPUT}', only {sorted(outputs)}")
     _check_node(outputs[OUTPUT], (contract.action.size,), f"{where}: contract: action ({contract.action.mode})")
+    if contract.state_size:
+        if NEXT_STATE not in outputs:
+            raise InputError(f"{where}: contract: the graph has no output '{NEXT_STATE}', only {sorted(outputs)}")
+        _check_node(outputs[NEXT_STATE], (contract.state_size,), f"{where}: contract: state_size: '{NEXT_STATE}'")
     return contract
 
 
@@ -96,6 +113,11 @@ def check_fit(
     contract: PolicyContract, lidar: LidarSpec, map_settings: MapSettings, limits: VehicleLimits, where: str
 ) -> None:
     """Raise InputError naming the field, what the model wants and what this drone has, unless they fit."""
+    if contract.paradigm == "ctce":
+        raise InputError(
+            f"{where}: contract: paradigm: the model (ctce) wants what the whole team sees and the whole level, this "
+            "drone has its own observation; fly one trained with ctde or dtde, and this one in `imagine evaluate`"
+        )
     for name, wanted, has in _misfits(contract, lidar, map_settings, limits):
         raise InputError(
             f"{where}: contract: {name}: the model wants {_shown(wanted)}, this drone has {_shown(has)}; "

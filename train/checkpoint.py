@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from imagine.core.config import check_settings
 from imagine.core.errors import InputError
 from imagine.train.atomic_file import write_atomically
-from imagine.train.networks import Actor
+from imagine.train.networks import Actor, steers
 from imagine.train.settings import TrainSettings
 
 FORMAT = "imagine-checkpoint-1"
@@ -84,7 +84,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 def load_weights(network: nn.Module, weights: dict[str, Tensor], where: str) -> None:
     """Put a checkpoint's weights into a network. Raises InputError naming the first tensor that does not fit."""
     own = network.state_dict()
-    for name in own.keys() | weights.keys():
+    for name in dict.fromkeys((*own, *weights)):
         if name not in weights:
             raise InputError(f"{where}: made for another network: it has no '{name}'")
         if name not in own:
@@ -95,10 +95,27 @@ def load_weights(network: nn.Module, weights: dict[str, Tensor], where: str) -> 
     network.load_state_dict(weights)
 
 
+def check_same_network(checkpoint: Checkpoint, settings: TrainSettings, where: str) -> None:
+    """Raise InputError naming the first setting of the networks in which a checkpoint differs from a run."""
+    for group, saved, wanted in (
+        ("network", checkpoint.settings.network, settings.network),
+        ("env.observation", checkpoint.settings.env.observation, settings.env.observation),
+        ("env.action", checkpoint.settings.env.action, settings.env.action),
+    ):
+        for name in type(saved).model_fields:
+            has, needs = getattr(saved, name), getattr(wanted, name)
+            if has != needs and name != "log_std":  # that one is where learning began
+                raise InputError(
+                    f"{where}: made for another network: {group}.{name} is {has} in it, {needs} here; "
+                    "leave the setting as it was, or train anew"
+                )
+
+
 def actor_of(checkpoint: Checkpoint, where: str) -> Actor:
     """Return the policy of a checkpoint, ready to fly."""
     settings = checkpoint.settings
-    actor = Actor(settings.network, settings.env.observation, settings.env.action.size)
+    observation, action = settings.env.observation, settings.env.action
+    actor = Actor(settings.network, observation, action.size, steers(observation, action))
     load_weights(actor, checkpoint.actor, where)
     return actor.eval()
 

@@ -17,7 +17,7 @@ from imagine.sim.film import Film
 from imagine.sim.level import load_level
 from imagine.sim.metrics import BYTE_KINDS, CONTACT_KINDS, EpisodeMetrics
 from imagine.train.evaluation_env import evaluation_env
-from imagine.train.policies import Policy, load_policy
+from imagine.train.policies import Policy, PolicyPilot, load_policy
 
 MAX_WORLDS = 16
 _RESAMPLES = 2000
@@ -108,6 +108,9 @@ def _first_episodes(
     if film is not None:
         film.take(exploration, 0)
     first: dict[int, EpisodeMetrics] = {}
+    pilot = None if isinstance(policy, str) else PolicyPilot(policy)
+    if pilot is not None:
+        pilot.begin(exploration)
     shape = (exploration.worlds, exploration.drones, exploration.settings.action.size)
     while len(first) < exploration.worlds:
         if policy == "frontier":
@@ -115,11 +118,13 @@ def _first_episodes(
         elif policy == "random":
             actions = rng.uniform(-1.0, 1.0, shape).astype(np.float32)
         else:
-            flat = {key: np.ascontiguousarray(a.reshape(-1, *a.shape[2:])) for key, a in observation.policy.items()}
-            actions = np.clip(policy.act(flat), -1.0, 1.0).reshape(shape)
+            assert pilot is not None
+            actions = pilot.act(exploration, observation)
         step = exploration.step(actions)
         if film is not None and 0 not in first:
             film.take(exploration, 0)
+        if pilot is not None:
+            pilot.forget(step.done)
         for episode in step.episodes:
             first.setdefault(episode.world, episode)
         observation = step.observation

@@ -5,21 +5,22 @@ Learning from the planner's own flights alone fails: the first error leads where
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
 from typing import Literal
 
 import numpy as np
 import torch
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 from imagine.core.config import Settings
 from imagine.core.errors import WorkError
 from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.metrics import EpisodeMetrics
-from imagine.train.networks import Actor
+from imagine.train.labels import LabelBuffer, Round, RoundBuffer
+from imagine.train.networks import Actor, Precision, at_precision
 from imagine.train.pilots import Pilot
-from imagine.train.rollout import actor_inputs, env_actions, policy_tensors
+from imagine.train.rollout import Recall, agent_tensors, env_actions, living, next_means, stored
 
 
 class ImitationSettings(Settings):
@@ -37,41 +38,15 @@ class ImitationSettings(Settings):
     buffer_samples: int = Field(default=100_000, ge=1, description="newest labels kept; about 8.5 kB each")
     planner_share: float = Field(default=0.8, ge=0.0, le=1.0, description="drones the planner flies in round one")
     planner_share_until: float = Field(default=0.5, ge=0.0, le=1.0, description="share of imitation when it reaches 0")
+    precision: Precision = Field(default="auto", description="of layers, while flying and learning")
     cosine_weight: float = Field(default=0.25, ge=0.0, description="of the direction's error, beside the square error")
 
 
-@dataclass
-class LabelBuffer:
-    """The newest labelled observations, in a ring; images in half precision, they are what costs memory."""
-
-    capacity: int
-    arrays: dict[str, Tensor] = field(default_factory=dict)
-    labels: Tensor = field(default_factory=lambda: torch.empty(0))
-    written: int = 0
-
-    def __len__(self) -> int:
-        """Labels held."""
-        return min(self.written, self.capacity)
-
-    def add(self, observations: dict[str, Tensor], labels: Tensor) -> None:
-        """Take labelled observations `[samples, ...]`; the oldest give way."""
-        if not self.arrays:
-            self.arrays = {
-                key: torch.empty((self.capacity, *value.shape[1:]), dtype=torch.float16)
-                for key, value in observations.items()
-            }
-            self.labels = torch.empty((self.capacity, labels.shape[1]))
-        labels = labels[-self.capacity :]
-        at = (self.written + torch.arange(len(labels))) % self.capacity
-        for key, array in self.arrays.items():
-            array[at] = observations[key][-self.capacity :].to(array.dtype)
-        self.labels[at] = labels
-        self.written += len(labels)
-
-    def sample(self, count: int, generator: torch.Generator) -> tuple[dict[str, Tensor], Tensor]:
-        """Return a random minibatch (with replacement) of observations and labels."""
-        at = torch.randint(len(self), (count,), generator=generator)
-        return {key: array[at].float() for key, array in self.arrays.items()}, self.labels[at]
+def label_buffer(actor: Actor, samples: int) -> LabelBuffer | RoundBuffer:
+    """Return a buffer for as many labels: single ones, or whole rounds where what is learned are sequences or teams."""
+    return (
+        RoundBuffer(samples, bool(actor.state_size)) if actor.state_size or actor.is_central else LabelBuffer(samples)
+    )
 
 
 @torch.no_grad()
@@ -80,33 +55,48 @@ def collect_labels(
     observation: Observation,
     actor: Actor,
     teacher: Pilot,
-    buffer: LabelBuffer,
+    buffer: LabelBuffer | RoundBuffer,
     steps: int,
     planner_share: float,
     rng: np.random.Generator,
     generator: torch.Generator,
+    precision: Precision = "float32",
+    recall: Recall | None = None,
 ) -> tuple[Observation, list[EpisodeMetrics], int]:
     """Fly `steps` in all worlds and label every state; return the next observation, finished episodes and labels added.
 
     Which drones the planner flies is drawn once a call, so that the student's own mistakes have time to unfold.
+    `recall` is what the student remembers so far, and is brought up to date; without one everybody's episode begins.
     """
-    planner_flies = torch.from_numpy(rng.random(env.worlds * env.drones) < planner_share)
+    agents = env.worlds * env.drones
+    recall = recall or Recall.nothing(actor, agents)
+    planner_flies = torch.from_numpy(rng.random(agents) < planner_share)
     episodes: list[EpisodeMetrics] = []
     added = 0
-    for _ in range(steps):
-        tensors = policy_tensors(observation)
-        labels = torch.from_numpy(teacher.act(env, observation).reshape(len(planner_flies), -1))
-        labelled = torch.isfinite(labels).all(dim=1)
-        buffer.add({key: tensor[labelled] for key, tensor in tensors.items()}, labels[labelled])
-        added += int(labelled.sum())
-        mean = actor(*actor_inputs(tensors))
-        actions = mean + actor.spread().exp() * torch.randn(mean.shape, generator=generator)
-        by_planner = planner_flies & labelled
-        actions[by_planner] = labels[by_planner]
-        step = env.step(env_actions(actions, env))
-        teacher.forget(step.done)
-        episodes.extend(step.episodes)
-        observation = step.observation
+    flown = Round.empty(recall) if isinstance(buffer, RoundBuffer) else None
+    with at_precision(precision, actor):
+        for _ in range(steps):
+            seen = stored(agent_tensors(observation, actor.is_central), torch.float16, actor.device)
+            alive = living(env)
+            labels = torch.from_numpy(teacher.act(env, observation).reshape(agents, -1))
+            labelled = torch.isfinite(labels).all(dim=1)
+            added += int(labelled.sum())
+            if flown is not None:
+                flown.add(seen, labels, alive, recall.starts)
+            elif isinstance(buffer, LabelBuffer):
+                buffer.add({key: value[labelled] for key, value in seen.items()}, labels[labelled])
+            mean = next_means(actor, {**seen, "alive": alive.to(actor.device)}, recall, env.drones)
+            noise = torch.randn(mean.shape, generator=generator)
+            actions = (mean + actor.spread().exp() * noise.to(actor.device)).cpu()
+            by_planner = planner_flies & labelled
+            actions[by_planner] = labels[by_planner]
+            step = env.step(env_actions(actions, env))
+            teacher.forget(step.done)
+            episodes.extend(step.episodes)
+            observation = step.observation
+            recall.starts = torch.from_numpy(np.repeat(step.done, env.drones)).to(actor.device)
+    if flown is not None and isinstance(buffer, RoundBuffer):
+        buffer.add_round(flown, env.drones if actor.is_central else 1)
     return observation, episodes, added
 
 
@@ -123,20 +113,28 @@ def imitation_loss(mean: Tensor, labels: Tensor, cosine_weight: float) -> Tensor
 def learn(
     actor: Actor,
     optimiser: torch.optim.Optimizer,
-    buffer: LabelBuffer,
+    buffer: LabelBuffer | RoundBuffer,
     settings: ImitationSettings,
     generator: torch.Generator,
 ) -> float:
-    """Take a round's gradient steps toward the labels; return the mean loss. Raises WorkError when it is not finite."""
+    """Take a round's gradient steps toward the labels; return the mean loss.
+
+    Raises WorkError where a loss or gradient is not finite, before it reaches the weights.
+    """
     losses = []
-    for _ in range(settings.gradient_steps):
-        tensors, labels = buffer.sample(settings.minibatch, generator)
-        loss = imitation_loss(actor(*actor_inputs(tensors)), labels, settings.cosine_weight)
-        if not torch.isfinite(loss):
-            raise WorkError(f"imitation diverged: the loss is {loss.item()}; lower imitation.lr")
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(actor.parameters(), 1.0)
-        optimiser.step()
-        losses.append(loss.item())
+    with at_precision(settings.precision, actor):
+        for _ in range(settings.gradient_steps):
+            batch = buffer.sample(settings.minibatch, generator)
+            mean, labels = batch.of_counted(batch.decide(actor).mean), batch["labels"]
+            loss = imitation_loss(mean, labels, settings.cosine_weight)
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            norm = float(nn.utils.clip_grad_norm_(actor.parameters(), 1.0))
+            if not (math.isfinite(loss.item()) and math.isfinite(norm)):
+                raise WorkError(
+                    f"imitation diverged: the loss of the actor is {loss.item()}, its gradient {norm} long; "
+                    "go on from the last checkpoint with a smaller imitation.lr, or with imitation.precision float32"
+                )
+            optimiser.step()
+            losses.append(loss.item())
     return float(np.mean(losses))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from imagine.core.config import Settings
-from imagine.train.precision import Precision
+from imagine.train.networks import Precision
 from imagine.train.schedules import PositiveSchedule, WeightSchedule
 
 
@@ -37,6 +37,10 @@ class PpoSettings(Settings):
     value_normalisation: bool = Field(default=True, description="the critic learns returns less their mean, over std")
     value_clip: float | None = Field(
         default=None, gt=0.0, description="how far a value may move with gain, in deviations of returns"
+    )
+    value_weight: float = Field(default=0.5, gt=0.0, description="of the value loss, where the encoder is shared")
+    sequence_steps: int = Field(
+        default=16, ge=1, description="steps that a memory is trained over; at most so many, as divide rollout_steps"
     )
     precision: Precision = Field(
         default="auto", description="of layers, in rollouts and updates; auto: what is quicker"

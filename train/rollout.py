@@ -11,86 +11,126 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from imagine.core.contract import LEVEL
 from imagine.sim.exploration import Exploration, Observation, Step
 from imagine.sim.metrics import EpisodeMetrics
-from imagine.train.networks import Actor, Critic, log_probability
-from imagine.train.precision import Precision, at_precision
+from imagine.train.networks import Actor, Precision, at_precision, log_probability
+from imagine.train.networks.actor import Seen
 
-OBSERVATION_KEYS = ("views", "lidar", "motion", "frontiers")
-"""Inputs of an actor, in the order of its `forward`; the last is there where the specification shows frontiers."""
+
+@dataclass
+class Recall:
+    """What the drones of a batch of worlds remember between two decisions; whoever flies them carries it along.
+
+    `state` `[agents, state size]`; `starts` bool `[agents]` tells whose episode begins with the next decision, so that
+    its state no longer counts.
+    """
+
+    state: Tensor
+    starts: Tensor
+
+    @staticmethod
+    def nothing(actor: Actor, agents: int) -> Recall:
+        """Return what is remembered where all episodes begin."""
+        device = actor.device
+        return Recall(
+            torch.zeros((agents, actor.state_size), device=device), torch.ones(agents, dtype=torch.bool, device=device)
+        )
+
+    def copy(self) -> Recall:
+        """Return it as it is now."""
+        return Recall(self.state.clone(), self.starts.clone())
 
 
 @dataclass
 class Rollout:
-    """Steps of all drones of all worlds; tensors `[steps, agents, ...]`, agents = worlds x drones.
+    """Steps of all drones of all worlds; tensors `[steps, agents, ...]`, agents = worlds x drones, in that order.
 
     `alive` tells which drones acted: what a dead one is said to have done counts for nothing. `dones[t]` tells that a
     drone's own episode ended with step t, by its death or with the world's, and `truncated[t]` that the clock ended it
-    while it still flew. `last` holds the observation after the last step, `[agents, ...]`; `level` images are the
-    critic's own; `env_s` is the time the environment took. Images are kept in half precision, channels last: they are
-    what costs memory, and the policy acts by them as they are kept.
+    while it still flew. `last` holds the observation after the last step, `[agents, ...]`, and `recall` what was
+    remembered then; `level` images are the critic's own (and a centralised actor's); `env_s` is the time the
+    environment took. Images are kept in half precision, channels last: they are what costs memory, and the policy acts
+    by them as they are kept.
+
+    For actors with a memory, `starts[t]` tells whose episode began with step t, and `states` `[chunks, agents, size]`
+    what was remembered before each `sequence_steps` steps.
     """
 
-    observations: dict[str, Tensor]
+    observations: Seen
     actions: Tensor
     log_probs: Tensor
     rewards: Tensor
     dones: Tensor
-    last: dict[str, Tensor]
+    last: Seen
     alive: Tensor
     episodes: list[EpisodeMetrics] = field(default_factory=list)
     env_s: float = 0.0
     truncated: Tensor | None = None
+    drones: int = 1
+    starts: Tensor | None = None
+    states: Tensor | None = None
+    recall: Recall | None = None
 
     @property
     def agent_steps(self) -> int:
         """Decisions taken, over all drones."""
         return int(self.alive.sum())
 
+    @property
+    def sequence_steps(self) -> int:
+        """Steps that are learned from together; 1 without memory."""
+        return 1 if self.states is None else self.actions.shape[0] // self.states.shape[0]
 
-def policy_tensors(observation: Observation) -> dict[str, Tensor]:
+
+def policy_tensors(observation: Observation) -> Seen:
     """Return what the policy sees, `[worlds, drones, ...]`, as tensors `[agents, ...]`, good as long as it is."""
-    arrays = observation.policy
-    return {key: torch.from_numpy(array.reshape(-1, *array.shape[2:])) for key, array in arrays.items()}
+    return {key: torch.from_numpy(array.reshape(-1, *array.shape[2:])) for key, array in observation.policy.items()}
 
 
-def agent_tensors(observation: Observation) -> dict[str, Tensor]:
-    """Return `policy_tensors`, and the images of the critic's own as `level`."""
-    level = observation.critic
-    return {**policy_tensors(observation), "level": torch.from_numpy(level.reshape(-1, *level.shape[2:]))}
+def agent_tensors(observation: Observation, sees_level: bool = True) -> Seen:
+    """Return `policy_tensors`, and the images of the whole level as `level` where anybody sees them."""
+    tensors = policy_tensors(observation)
+    if sees_level:
+        level = observation.critic
+        tensors[LEVEL] = torch.from_numpy(level.reshape(-1, *level.shape[2:]))
+    return tensors
 
 
-def actor_inputs(tensors: dict[str, Tensor]) -> tuple[Tensor, ...]:
-    """Return the actor's inputs in the order of its `forward`."""
-    return tuple(tensors[key] for key in OBSERVATION_KEYS if key in tensors)
+def living(env: Exploration) -> Tensor:
+    """Return who still flies, bool `[agents]`."""
+    return torch.from_numpy(env.alive.reshape(-1).copy())
 
 
-def critic_inputs(tensors: dict[str, Tensor]) -> tuple[Tensor, ...]:
-    """Return the critic's inputs in the order of its `forward`."""
-    keys = ("views", "lidar", "motion", "level", "frontiers")
-    return tuple(tensors[key] for key in keys if key in tensors)
-
-
-def stored(tensors: dict[str, Tensor], dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
+def stored(tensors: Seen, dtype: torch.dtype, device: torch.device) -> Seen:
     """Return an observation as rollouts keep it: on the device of the networks, images `dtype` and channels last."""
     return {
         key: value.to(device, dtype).contiguous(memory_format=torch.channels_last)
         if value.ndim == 4
-        else value.to(device)
+        else value.to(device, copy=True)
         for key, value in tensors.items()
     }
 
 
-def _room(steps: int, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def room_for(steps: int, tensors: Seen) -> Seen:
     """Return room for `steps` of what `stored` gave, `[steps, ...]`, images channels last."""
     room = {}
     for key, value in tensors.items():
-        format = torch.channels_last if value.ndim == 4 else torch.contiguous_format
-        flat = torch.empty(
-            (steps * value.shape[0], *value.shape[1:]), dtype=value.dtype, device=value.device, memory_format=format
-        )
+        layout = torch.channels_last if value.ndim == 4 else torch.contiguous_format
+        size = (steps * value.shape[0], *value.shape[1:])
+        flat = torch.empty(size, dtype=value.dtype, device=value.device, memory_format=layout)
         room[key] = flat.view(steps, value.shape[0], *value.shape[1:])
     return room
+
+
+def image_dtype(actor: Actor) -> torch.dtype:
+    """Return how images are kept: as the network computes, or in half the space where that is float32."""
+    return torch.bfloat16 if actor.dtype == torch.bfloat16 else torch.float16
+
+
+def chunk_steps(steps: int, wanted: int) -> int:
+    """Return the largest number of steps, at most `wanted`, that a rollout of `steps` is a multiple of."""
+    return next(length for length in range(min(wanted, steps), 0, -1) if steps % length == 0)
 
 
 @torch.no_grad()
@@ -101,49 +141,79 @@ def collect(
     steps: int,
     generator: torch.Generator,
     precision: Precision = "float32",
+    recall: Recall | None = None,
+    sequence_steps: int = 16,
 ) -> tuple[Rollout, Observation]:
-    """Act `steps` times by draws from the policy; return the rollout and the observation to go on from."""
+    """Act `steps` times by draws from the policy; return the rollout and the observation to go on from.
+
+    `recall` is what is remembered so far, and is brought up to date; without one everybody's episode begins. What is
+    learned from together are `sequence_steps` steps, or as many fewer as divide `steps`.
+    """
     with at_precision(precision, actor):
-        return _collect(env, observation, actor, steps, generator)
+        recall = recall or Recall.nothing(actor, env.worlds * env.drones)
+        return _collect(env, observation, actor, steps, generator, recall, chunk_steps(steps, sequence_steps))
 
 
 def _collect(
-    env: Exploration, observation: Observation, actor: Actor, steps: int, generator: torch.Generator
+    env: Exploration,
+    observation: Observation,
+    actor: Actor,
+    steps: int,
+    generator: torch.Generator,
+    recall: Recall,
+    chunk: int,
 ) -> tuple[Rollout, Observation]:
     agents, device = env.worlds * env.drones, actor.device
-    images = torch.bfloat16 if actor.dtype == torch.bfloat16 else torch.float16
-    tensors = stored(agent_tensors(observation), images, device)
-    kept = _room(steps, tensors)
-    action_size = actor.log_std.shape[0]
-    actions = torch.empty((steps, agents, action_size), device=device)
+    images, sees_level = image_dtype(actor), actor.paradigm != "dtde"
+    seen = stored(agent_tensors(observation, sees_level), images, device)
+    kept = room_for(steps, seen)
+    actions = torch.empty((steps, agents, actor.action_size), device=device)
     log_probs, rewards = (torch.empty((steps, agents), device=device) for _ in range(2))
     dones, alive, truncated = (torch.empty((steps, agents), dtype=torch.bool, device=device) for _ in range(3))
+    starts, states = (
+        (torch.empty((steps, agents), dtype=torch.bool, device=device), []) if actor.state_size else (None, [])
+    )
     episodes: list[EpisodeMetrics] = []
     env_s = 0.0
     log_std = actor.spread()
     for t in range(steps):
-        for key, value in tensors.items():
+        for key, value in seen.items():
             kept[key][t] = value
-        mean = actor(*actor_inputs(tensors))
-        actions[t] = mean + log_std.exp() * torch.randn((agents, action_size), generator=generator).to(device)
-        log_probs[t] = log_probability(actions[t], mean, log_std)
         flying = env.alive.copy()
+        alive[t] = torch.from_numpy(flying.reshape(-1))
+        if starts is not None:
+            starts[t] = recall.starts
+            if t % chunk == 0:
+                states.append(recall.state.clone())
+        mean = next_means(actor, {**seen, "alive": alive[t]}, recall, env.drones)
+        actions[t] = mean + log_std.exp() * torch.randn(mean.shape, generator=generator).to(device)
+        log_probs[t] = log_probability(actions[t], mean, log_std)
         began = time.perf_counter()
         step = env.step(env_actions(actions[t], env))
         env_s += time.perf_counter() - began
-        ended = step.done[:, None]
+        ended = np.broadcast_to(step.done[:, None], flying.shape)
         died = flying & ~env.alive  # a world that starts anew has everyone alive again
-        alive[t] = torch.from_numpy(flying.reshape(-1))
         rewards[t] = torch.from_numpy(step.reward.reshape(-1))
         dones[t] = torch.from_numpy((ended | died).reshape(-1))
         truncated[t] = torch.from_numpy((flying & late_worlds(step, env)[:, None]).reshape(-1))
+        recall.starts = torch.from_numpy(ended.reshape(-1).copy()).to(device)
         episodes.extend(step.episodes)
         observation = step.observation
-        tensors = stored(agent_tensors(observation), images, device)
-    return (
-        Rollout(kept, actions, log_probs, rewards, dones, tensors, alive, episodes, env_s, truncated),
-        observation,
-    )
+        seen = stored(agent_tensors(observation, sees_level), images, device)
+    rollout = Rollout(
+        kept, actions, log_probs, rewards, dones, {**seen, "alive": living(env).to(device)}, alive, episodes, env_s,
+        truncated, env.drones, starts, torch.stack(states) if states else None, recall.copy(),
+    )  # fmt: skip
+    return rollout, observation
+
+
+def next_means(actor: Actor, seen: Seen, recall: Recall, drones: int) -> Tensor:
+    """Return the means of the next actions, `[agents, action size]`, and take what they leave into `recall`."""
+    if not actor.state_size:
+        return actor.decide(seen, drones=drones).mean
+    decisions = actor.decide(seen, recall.state, recall.starts[None], drones)
+    recall.state = decisions.state
+    return decisions.mean
 
 
 def late_worlds(step: Step, env: Exploration) -> NDArray[np.bool_]:
@@ -159,33 +229,6 @@ def env_actions(actions: Tensor, env: Exploration) -> NDArray[np.float32]:
     """Return actions `[agents, size]` as the environment takes them, `[worlds, drones, size]` in [-1, 1]."""
     wanted: NDArray[np.float32] = actions.clamp(-1.0, 1.0).reshape(env.worlds, env.drones, -1).cpu().numpy()
     return wanted
-
-
-def flattened(rollout: Rollout) -> dict[str, Tensor]:
-    """Return a rollout's observations as samples, `[steps * agents, ...]`, without a copy."""
-    return {key: value.flatten(0, 1) for key, value in rollout.observations.items()}
-
-
-def take(samples: dict[str, Tensor], at: Tensor) -> dict[str, Tensor]:
-    """Return the samples at these indices; images stay channels last, gathered as whole rows."""
-    return {
-        key: value.permute(0, 2, 3, 1).index_select(0, at).permute(0, 3, 1, 2)
-        if value.ndim == 4
-        else value.index_select(0, at)
-        for key, value in samples.items()
-    }
-
-
-@torch.no_grad()
-def values_of(critic: Critic, rollout: Rollout, minibatch: int) -> tuple[Tensor, Tensor]:
-    """Return the critic's values of all steps, `[steps, agents]`, and of the state after the last, `[agents]`."""
-    flat = flattened(rollout)
-    count = rollout.rewards.numel()
-    pieces = [
-        critic.values(*(piece[i : i + minibatch] for piece in critic_inputs(flat))) for i in range(0, count, minibatch)
-    ]
-    last = critic.values(*critic_inputs(rollout.last))
-    return torch.cat(pieces).reshape(rollout.rewards.shape), last
 
 
 def mean_of(records: Sequence[dict[str, float]]) -> dict[str, float]:

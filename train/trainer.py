@@ -23,15 +23,15 @@ from imagine.core.errors import InputError
 from imagine.sim.exploration import Exploration
 from imagine.train.atomic_file import write_atomically
 from imagine.train.baselines import baseline
-from imagine.train.checkpoint import Checkpoint, Phase, load_checkpoint, load_weights
+from imagine.train.checkpoint import Checkpoint, Phase, check_same_network, load_checkpoint, load_weights
 from imagine.train.curriculum import Curriculum
 from imagine.train.evaluation import evaluate
-from imagine.train.imitation import LabelBuffer, collect_labels, learn
-from imagine.train.networks import Actor, Critic
+from imagine.train.imitation import collect_labels, label_buffer, learn
+from imagine.train.networks import Actor, Critic, steers
 from imagine.train.policies import policy_of
 from imagine.train.ppo import Optimisers, update
 from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
-from imagine.train.rollout import collect
+from imagine.train.rollout import Recall, collect
 from imagine.train.run_folder import RunFolder, run_record
 from imagine.train.settings import TrainSettings, load_train_settings
 
@@ -102,7 +102,7 @@ class Learner:
         """Return a fresh learner; the seed decides its weights and draws."""
         torch.manual_seed(settings.run.seed)  # layers initialise from the global generator
         observation, action = settings.env.observation, settings.env.action
-        actor = Actor(settings.network, observation, action.size)
+        actor = Actor(settings.network, observation, action.size, steers(observation, action))
         critic = Critic(settings.network, observation)
         return Learner(
             actor,
@@ -148,7 +148,9 @@ class Trainer:
         self.learner = Learner.create(self.settings)
         self.episodes = RecentEpisodes(self.settings.env.episode_ticks, self.settings.env.levels)
         self._wall_before_s = 0.0
+        self._recall = Recall.nothing(self.learner.actor, self.env.worlds * self.env.drones)
         if self.resumed is not None:
+            check_same_network(self.resumed, self.settings, "checkpoint")
             self.learner.restore(self.resumed)
             self.agent_steps = dict(self.resumed.agent_steps)
             self.updates, self.phase = self.resumed.updates, self.resumed.phase
@@ -171,7 +173,7 @@ class Trainer:
     def _imitate(self) -> None:
         """Let the student fly and learn from the planner's labels, round after round."""
         settings, learner = self.settings.imitation, self.learner
-        buffer = LabelBuffer(settings.buffer_samples)
+        buffer = label_buffer(learner.actor, settings.buffer_samples)
         teacher = baseline(settings.teacher, self.settings.run.seed)
         teacher.begin(self.env)
         while self.agent_steps["imitation"] < settings.agent_steps and not self._stop.is_set():
@@ -181,7 +183,7 @@ class Trainer:
             planner_share = settings.planner_share * max(0.0, 1.0 - done_share / until)
             self._observation, episodes, labels = collect_labels(
                 self.env, self._observation, learner.actor, teacher, buffer, settings.round_steps, planner_share,
-                learner.rng, learner.generator,
+                learner.rng, learner.generator, settings.precision, self._recall,
             )  # fmt: skip
             collected = time.monotonic()
             for group in learner.imitation.param_groups:
@@ -202,7 +204,7 @@ class Trainer:
             began = time.monotonic()
             rollout, self._observation = collect(
                 self.env, self._observation, learner.actor, settings.rollout_steps, learner.generator,
-                settings.precision,
+                settings.precision, self._recall, settings.sequence_steps,
             )  # fmt: skip
             collected = time.monotonic()
             numbers = update(

@@ -18,6 +18,8 @@ from imagine.core.vehicle_limits import VehicleLimits
 from imagine.onboard.onnx_weights import hash_weights
 from imagine.onboard.policy import OnnxPolicy, check_fit
 
+NOTHING = np.zeros(0, np.float32)
+
 
 def zeros(contract):
     return {name: np.zeros(shape, np.float32) for name, shape in contract.observation.shapes.items()}
@@ -33,7 +35,8 @@ def refusal(call, *args) -> str:
 
 def test_a_model_that_keeps_its_contract_loads_and_answers(tmp_path):
     policy = OnnxPolicy.load(write_policy(tmp_path / "p.onnx"))
-    action = policy.infer(zeros(policy.contract))
+    action, state = policy.infer(zeros(policy.contract), NOTHING)
+    assert state.shape == (0,)
     assert action.dtype == np.float32
     assert action.tolist() == [1.0, 0.0]
 
@@ -42,7 +45,7 @@ def test_the_same_observation_gives_the_same_bits(tmp_path):
     policy = OnnxPolicy.load(write_policy(tmp_path / "p.onnx"))
     rng = np.random.default_rng(3)
     observation = {name: rng.random(shape, np.float32) for name, shape in policy.contract.observation.shapes.items()}
-    assert policy.infer(observation).tobytes() == policy.infer(observation).tobytes()
+    assert policy.infer(observation, NOTHING)[0].tobytes() == policy.infer(observation, NOTHING)[0].tobytes()
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -35,12 +35,12 @@ class Answers:
         self.answers = list(answers)
         self.seen: list[dict[str, np.ndarray]] = []
 
-    def infer(self, observation):
+    def infer(self, observation, state):
         self.seen.append(observation)
         answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
         if isinstance(answer, str):
             raise WorkError(answer)
-        return np.array(answer, np.float32)
+        return np.array(answer, np.float32), state
 
 
 def exploring(flight: FlatFlight):

@@ -36,11 +36,11 @@ class FixedPolicy:
         self.error = error
         self.seen = []
 
-    def infer(self, observation):
+    def infer(self, observation, state):
         self.seen.append(observation)
         if self.error is not None:
             raise WorkError(self.error)
-        return self.answer
+        return self.answer, state
 
 
 def exploring(flight: FlatFlight):

@@ -11,7 +11,7 @@ from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.gae import advantages_and_returns
 from imagine.train.networks import Actor, Critic, NetworkSettings, log_probability
 from imagine.train.ppo import Optimisers, PpoSettings, update
-from imagine.train.rollout import Rollout, actor_inputs, collect
+from imagine.train.rollout import Rollout, collect
 
 SPEC = ObservationSpec(view_cells=16, lidar_sectors=16)
 SMALL = NetworkSettings(view_channels=(8, 8, 8), critic_channels=(8, 8), lidar_channels=4, hidden=32)
@@ -31,7 +31,7 @@ def rollout_with_dead_drones(actor, garbage):
     observations = {key: torch.rand((steps, agents, *shape), generator=generator) for key, shape in SPEC.shapes.items()}
     observations["level"] = torch.rand((steps, agents, 5, 32, 32), generator=generator)
     with torch.no_grad():
-        mean = actor(*(value.flatten(0, 1) for value in actor_inputs(observations)))
+        mean = actor(*(observations[key].flatten(0, 1) for key in ("views", "lidar", "motion")))
         actions = mean + actor.spread().exp() * torch.randn(mean.shape, generator=generator)
         log_probs = log_probability(actions, mean, actor.spread()).reshape(steps, agents)
     actions = actions.reshape(steps, agents, 2)

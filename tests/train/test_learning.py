@@ -6,10 +6,11 @@ from imagine.core.errors import WorkError
 from imagine.core.observation_spec import ObservationSpec
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
-from imagine.train.imitation import ImitationSettings, LabelBuffer, collect_labels, imitation_loss, learn
+from imagine.train.imitation import ImitationSettings, collect_labels, imitation_loss, learn
+from imagine.train.labels import LabelBuffer
 from imagine.train.networks import Actor, Critic, NetworkSettings, log_probability
 from imagine.train.ppo import Optimisers, PpoSettings, update
-from imagine.train.rollout import OBSERVATION_KEYS, Rollout, actor_inputs, collect
+from imagine.train.rollout import Rollout, collect
 
 SPEC = ObservationSpec(view_cells=16, lidar_sectors=16)
 SMALL = NetworkSettings(view_channels=(8, 8, 8), critic_channels=(8, 8), lidar_channels=4, hidden=32)
@@ -26,7 +27,7 @@ def rollout_that_pays_for_going_east(actor, generator, steps=8, agents=32):
     observations = {key: torch.rand((steps, agents, *shape), generator=generator) for key, shape in SPEC.shapes.items()}
     observations["level"] = torch.rand((steps, agents, 5, 32, 32), generator=generator)
     with torch.no_grad():
-        mean = actor(*(observations[key].flatten(0, 1) for key in OBSERVATION_KEYS))
+        mean = actor(*(observations[key].flatten(0, 1) for key in ("views", "lidar", "motion")))
         actions = mean + actor.spread().exp() * torch.randn(mean.shape, generator=generator)
         log_probs = log_probability(actions, mean, actor.spread())
     actions = actions.reshape(steps, agents, 2)
@@ -40,12 +41,12 @@ def rollout_that_pays_for_going_east(actor, generator, steps=8, agents=32):
 def test_ppo_learns_what_pays_and_what_it_is_worth():
     actor, critic, optimisers, generator = learners()
     first = rollout_that_pays_for_going_east(actor, generator)
-    before = actor(*(first.last[key] for key in OBSERVATION_KEYS)).detach()
+    before = actor(*(first.last[key] for key in ("views", "lidar", "motion"))).detach()
     losses = [update(actor, critic, optimisers, first, PPO, generator)["value_loss"]]
     for _ in range(8):
         rollout = rollout_that_pays_for_going_east(actor, generator)
         losses.append(update(actor, critic, optimisers, rollout, PPO, generator)["value_loss"])
-    after = actor(*(first.last[key] for key in OBSERVATION_KEYS)).detach()
+    after = actor(*(first.last[key] for key in ("views", "lidar", "motion"))).detach()
     assert (after - before)[:, 0].mean() > 0.05
     assert abs((after - before)[:, 1].mean()) < (after - before)[:, 0].mean() / 2
     assert losses[-1] < losses[0]
@@ -96,11 +97,11 @@ def test_imitation_comes_close_to_the_planner():
     rng = np.random.default_rng(0)
     _, _, added = collect_labels(env, env.reset(), actor, buffer, 60, 0.5, rng, generator)
     assert added == len(buffer) > 300
-    tensors, labels = buffer.sample(256, generator)
-    before = imitation_loss(actor(*actor_inputs(tensors)), labels, 0.25).item()
+    batch = buffer.sample(256, generator)
+    before = imitation_loss(batch.decide(actor).mean, batch["labels"], 0.25).item()
     optimiser = torch.optim.Adam(actor.parameters(), lr=settings.lr)
     learn(actor, optimiser, buffer, settings, generator)
-    after = imitation_loss(actor(*actor_inputs(tensors)), labels, 0.25).item()
+    after = imitation_loss(batch.decide(actor).mean, batch["labels"], 0.25).item()
     assert after < 0.3 * before
 
 
@@ -110,9 +111,9 @@ def test_the_buffer_keeps_the_newest_labels():
         numbers = torch.arange(first, first + 4.0)[:, None]
         buffer.add({"motion": numbers.repeat(1, 3)}, numbers.repeat(1, 2))
     assert len(buffer) == 10
-    tensors, labels = buffer.sample(500, torch.Generator().manual_seed(0))
-    assert set(labels[:, 0].tolist()) == set(range(14, 24))
-    assert torch.equal(tensors["motion"][:, 0], labels[:, 0])
+    batch = buffer.sample(500, torch.Generator().manual_seed(0))
+    assert set(batch["labels"][:, 0].tolist()) == set(range(14, 24))
+    assert torch.equal(batch["motion"][:, 0], batch["labels"][:, 0])
 
 
 def test_a_rollout_holds_what_was_seen_done_and_earned():
@@ -129,5 +130,5 @@ def test_a_rollout_holds_what_was_seen_done_and_earned():
     np.testing.assert_array_equal(rollout.observations["views"][0], seen.astype(np.float16))
     np.testing.assert_array_equal(rollout.last["level"], after.critic.reshape(4, 5, 32, 32).astype(np.float16))
     assert rollout.observations["views"].flatten(0, 1).is_contiguous(memory_format=torch.channels_last)
-    mean = actor(*(rollout.observations[key][4] for key in OBSERVATION_KEYS))
+    mean = actor(*(rollout.observations[key][4] for key in ("views", "lidar", "motion")))
     torch.testing.assert_close(rollout.log_probs[4], log_probability(rollout.actions[4], mean, actor.spread()))

@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imagine.core.observation_spec import ObservationSpec
-from imagine.train.networks import Actor, Critic, LidarEncoder, NetworkSettings, entropy, log_probability
+from imagine.train.networks import Actor, Critic, NetworkSettings, entropy, log_probability
+from imagine.train.networks.encoders import LidarEncoder
 
 
 def inputs(spec, batch):
@@ -29,7 +30,8 @@ def test_any_observation_spec_gets_its_networks(cells, sectors, action_size, bat
     mean = Actor(small, spec, action_size)(*inputs(spec, batch))
     assert mean.shape == (batch, action_size)
     assert mean.abs().max() < 1.0
-    assert Critic(small, spec)(*inputs(spec, batch), torch.rand(batch, 5, 32, 32)).shape == (batch,)
+    seen = {**dict(zip(spec.shapes, inputs(spec, batch), strict=True)), "level": torch.rand(batch, 5, 32, 32)}
+    assert Critic(small, spec)(seen).shape == (batch,)
 
 
 def test_an_untrained_policy_almost_stands_still():
@@ -45,7 +47,7 @@ def test_actor_and_critic_share_no_weights():
 
 def test_the_lidar_encoder_sees_no_seam():
     """Turning the scan by whole strides turns the feature maps, wherever the turn starts."""
-    convolutions = LidarEncoder(64, 4, 8).convolutions
+    convolutions = LidarEncoder("conv2", 64, 4, 8).convolutions
     scan = torch.rand(1, 1, 64)
     turned = convolutions(scan.roll(20, dims=2))
     torch.testing.assert_close(turned, convolutions(scan).roll(5, dims=2))
