@@ -20,7 +20,10 @@ from imagine.sim.metrics import EpisodeMetrics
 from imagine.train.labels import LabelBuffer, Round, RoundBuffer
 from imagine.train.networks import Actor, Precision, at_precision
 from imagine.train.pilots import Pilot
-from imagine.train.rollout import Recall, agent_tensors, env_actions, living, next_means, stored
+from imagine.train.rollout import Recall, agent_tensors, env_actions, living, next_decisions, stored
+
+_SAME_WAY = 0.03  # of 1 - cosine: directions up to about 10 degrees apart count as one
+_ALONG = 0.7  # cosine from which on a label points at a frontier
 
 
 class ImitationSettings(Settings):
@@ -85,9 +88,9 @@ def collect_labels(
                 flown.add(seen, labels, alive, recall.starts)
             elif isinstance(buffer, LabelBuffer):
                 buffer.add({key: value[labelled] for key, value in seen.items()}, labels[labelled])
-            mean = next_means(actor, {**seen, "alive": alive.to(actor.device)}, recall, env.drones)
-            noise = torch.randn(mean.shape, generator=generator)
-            actions = (mean + actor.spread().exp() * noise.to(actor.device)).cpu()
+            decisions = next_decisions(actor, {**seen, "alive": alive.to(actor.device)}, recall, env.drones)
+            drawn, _ = actor.draw(decisions, generator)
+            actions = actor.flown(seen, drawn).cpu()
             by_planner = planner_flies & labelled
             actions[by_planner] = labels[by_planner]
             step = env.step(env_actions(actions, env))
@@ -110,6 +113,20 @@ def imitation_loss(mean: Tensor, labels: Tensor, cosine_weight: float) -> Tensor
     return error + cosine_weight * (1.0 - cosine).mean()
 
 
+def choice_loss(scores: Tensor, frontiers: Tensor, labels: Tensor) -> Tensor:
+    """Return the cross-entropy of choices to the frontiers that lie in the direction of the labels.
+
+    `scores` `[rows, n]`, `frontiers` `[rows, n, numbers]`, `labels` `[rows, action size]`. Frontiers that begin with the
+    same way are one to a label, so its weight is shared among them; labels that point at none count for nothing.
+    """
+    frontiers, labels = frontiers.float(), labels[:, None, :2]
+    cosine = nn.functional.cosine_similarity(frontiers[..., 1:3], labels, dim=2, eps=1e-3)
+    cosine = torch.where(frontiers[..., 0] > 0.5, cosine, -1.0)
+    wanted = torch.softmax((cosine - 1.0) / _SAME_WAY, dim=1) * (cosine.amax(dim=1, keepdim=True) > _ALONG)
+    loss = -(wanted * torch.log_softmax(scores, dim=1)).sum(dim=1)
+    return loss.sum() / wanted.sum().clamp(min=1.0)
+
+
 def learn(
     actor: Actor,
     optimiser: torch.optim.Optimizer,
@@ -125,8 +142,11 @@ def learn(
     with at_precision(settings.precision, actor):
         for _ in range(settings.gradient_steps):
             batch = buffer.sample(settings.minibatch, generator)
-            mean, labels = batch.of_counted(batch.decide(actor).mean), batch["labels"]
-            loss = imitation_loss(mean, labels, settings.cosine_weight)
+            decisions, labels = batch.decide(actor), batch["labels"]
+            if decisions.scores is None:
+                loss = imitation_loss(batch.of_counted(decisions.mean), labels, settings.cosine_weight)
+            else:
+                loss = choice_loss(batch.of_counted(decisions.scores), batch["frontiers"], labels)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             norm = float(nn.utils.clip_grad_norm_(actor.parameters(), 1.0))

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from imagine.core.errors import WorkError
 from imagine.train.batches import Batch, Cut
 from imagine.train.gae import advantages_and_returns
-from imagine.train.networks import LOG_STD_RANGE, Actor, Critic, Decisions, at_precision, entropy, log_probability
+from imagine.train.networks import LOG_STD_RANGE, Actor, Critic, Decisions, at_precision
 from imagine.train.ppo_settings import PpoSettings
 from imagine.train.rollout import Rollout, mean_of
 from imagine.train.values import values_of
@@ -169,17 +169,18 @@ class _Update:
     def _policy_loss(self, batch: Batch, decisions: Decisions) -> tuple[Tensor, Record, bool]:
         """Return the loss, what the policy did since the rollout, and whether it is still near enough to go on."""
         settings, advantages = self.settings, batch["advantages"]
-        log_std = self.actor.spread()
-        now = log_probability(batch["actions"], batch.of_counted(decisions.mean), log_std)
+        scores = None if decisions.scores is None else batch.of_counted(decisions.scores)
+        now = self.actor.log_probability(batch.of_counted(decisions.mean), scores, batch["actions"])
         log_ratio = now - batch["log_probs"]
         ratio = log_ratio.exp()
         with torch.no_grad():  # the low-variance estimator of http://joschu.net/blog/kl-approx.html
             kl = (ratio - 1.0 - log_ratio).mean().item()
         clipped = ratio.clamp(1.0 - settings.clip, 1.0 + settings.clip)
         gain = torch.min(ratio * advantages, clipped * advantages).mean()
-        record = {"kl": kl, "clipped_share": (ratio != clipped).float().mean().item()}
+        uncertainty = self.actor.entropy(scores)
+        record = {"kl": kl, "clipped_share": (ratio != clipped).float().mean().item(), "entropy": uncertainty.item()}
         far = settings.kl_stop is not None and kl > settings.kl_stop
-        return -gain - self.entropy_weight * entropy(log_std), record, not far
+        return -gain - self.entropy_weight * uncertainty, record, not far
 
     def _descend(self, loss: Tensor, parts: dict[str, Tensor], networks: tuple[nn.Module, ...], of: str) -> float:
         """Take one gradient step and return the gradient's length, unless it or a loss is not finite."""
@@ -205,7 +206,6 @@ class _Update:
         return {
             **{f"action_std_{i}": value for i, value in enumerate(std)},
             "action_std": sum(std) / len(std),
-            "entropy": entropy(spread).item(),
             "entropy_weight": self.entropy_weight,
             "actor_lr": self.optimisers.actor.param_groups[0]["lr"],
             "critic_lr": self.optimisers.critic.param_groups[0]["lr"],

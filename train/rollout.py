@@ -14,7 +14,7 @@ from torch import Tensor
 from imagine.core.contract import LEVEL
 from imagine.sim.exploration import Exploration, Observation, Step
 from imagine.sim.metrics import EpisodeMetrics
-from imagine.train.networks import Actor, Precision, at_precision, log_probability
+from imagine.train.networks import Actor, Decisions, Precision, at_precision
 from imagine.train.networks.actor import Seen
 
 
@@ -52,6 +52,8 @@ class Rollout:
     remembered then; `level` images are the critic's own (and a centralised actor's); `env_s` is the time the
     environment took. Images are kept in half precision, channels last: they are what costs memory, and the policy acts
     by them as they are kept.
+
+    `actions` are what was drawn: actions, or the numbers of frontiers (`Actor.flown`).
 
     For actors with a memory, `starts[t]` tells whose episode began with step t, and `states` `[chunks, agents, size]`
     what was remembered before each `sequence_steps` steps.
@@ -167,7 +169,7 @@ def _collect(
     images, sees_level = image_dtype(actor), actor.paradigm != "dtde"
     seen = stored(agent_tensors(observation, sees_level), images, device)
     kept = room_for(steps, seen)
-    actions = torch.empty((steps, agents, actor.action_size), device=device)
+    actions = torch.empty((steps, agents, actor.taken_size), device=device)
     log_probs, rewards = (torch.empty((steps, agents), device=device) for _ in range(2))
     dones, alive, truncated = (torch.empty((steps, agents), dtype=torch.bool, device=device) for _ in range(3))
     starts, states = (
@@ -175,7 +177,6 @@ def _collect(
     )
     episodes: list[EpisodeMetrics] = []
     env_s = 0.0
-    log_std = actor.spread()
     for t in range(steps):
         for key, value in seen.items():
             kept[key][t] = value
@@ -185,11 +186,10 @@ def _collect(
             starts[t] = recall.starts
             if t % chunk == 0:
                 states.append(recall.state.clone())
-        mean = next_means(actor, {**seen, "alive": alive[t]}, recall, env.drones)
-        actions[t] = mean + log_std.exp() * torch.randn(mean.shape, generator=generator).to(device)
-        log_probs[t] = log_probability(actions[t], mean, log_std)
+        decisions = next_decisions(actor, {**seen, "alive": alive[t]}, recall, env.drones)
+        actions[t], log_probs[t] = actor.draw(decisions, generator)
         began = time.perf_counter()
-        step = env.step(env_actions(actions[t], env))
+        step = env.step(env_actions(actor.flown(seen, actions[t]), env))
         env_s += time.perf_counter() - began
         ended = np.broadcast_to(step.done[:, None], flying.shape)
         died = flying & ~env.alive  # a world that starts anew has everyone alive again
@@ -207,13 +207,13 @@ def _collect(
     return rollout, observation
 
 
-def next_means(actor: Actor, seen: Seen, recall: Recall, drones: int) -> Tensor:
-    """Return the means of the next actions, `[agents, action size]`, and take what they leave into `recall`."""
+def next_decisions(actor: Actor, seen: Seen, recall: Recall, drones: int) -> Decisions:
+    """Return the next decisions of all agents, and take what they leave to remember into `recall`."""
     if not actor.state_size:
-        return actor.decide(seen, drones=drones).mean
+        return actor.decide(seen, drones=drones)
     decisions = actor.decide(seen, recall.state, recall.starts[None], drones)
     recall.state = decisions.state
-    return decisions.mean
+    return decisions
 
 
 def late_worlds(step: Step, env: Exploration) -> NDArray[np.bool_]:

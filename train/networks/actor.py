@@ -8,10 +8,18 @@ import torch
 from torch import Tensor, nn
 
 from imagine.core.contract import LEVEL, NEXT_STATE, STATE, ActionSpec
+from imagine.core.errors import InputError
 from imagine.core.observation_spec import ObservationSpec
+from imagine.train.networks.choice import (
+    ChoiceHead,
+    choice_entropy,
+    choice_log_probability,
+    direction_of,
+    draw_choice,
+)
 from imagine.train.networks.computing import Computing, autocast
 from imagine.train.networks.encoders import LEVEL_CELLS, LEVEL_CHANNELS, Encoder, orthogonal
-from imagine.train.networks.gaussian import LOG_STD_RANGE
+from imagine.train.networks.gaussian import LOG_STD_RANGE, entropy, log_probability
 from imagine.train.networks.memory import FrameStack, GatedMemory
 from imagine.train.networks.settings import NetworkSettings
 from imagine.train.networks.team import TeamPooling
@@ -22,11 +30,15 @@ Seen = dict[str, Tensor]
 
 
 class Decisions(NamedTuple):
-    """Means of actions `[rows, action size]`, the features they came from, and the state after the last step."""
+    """Means of actions `[rows, action size]`, the features they came from, and the state after the last step.
+
+    With a choice among frontiers, `scores` `[rows, n]` are theirs, and the mean is the direction of the best.
+    """
 
     mean: Tensor
     features: Tensor
     state: Tensor
+    scores: Tensor | None = None
 
 
 class Actor(Computing):
@@ -37,9 +49,7 @@ class Actor(Computing):
     `next_state`. `state_size` is 0 without memory.
     """
 
-    def __init__(
-        self, settings: NetworkSettings, spec: ObservationSpec, action_size: int, steers: bool = True
-    ) -> None:
+    def __init__(self, settings: NetworkSettings, spec: ObservationSpec, action_size: int, steers: bool = True) -> None:
         """`steers`: the action begins with a direction along the axes of the observation, as frontiers are shown."""
         super().__init__()
         self.settings, self.action_size = settings, action_size
@@ -59,6 +69,16 @@ class Actor(Computing):
         self.steering: nn.Parameter | None = None
         if spec.frontiers and steers:
             self.steering = nn.Parameter(torch.tensor(_STEERING))
+        self.choice: ChoiceHead | None = None
+        if settings.head == "choice":
+            if self.steering is None:
+                raise InputError(
+                    "network.head: choice needs env.observation.frontiers above 0, and actions that are a direction "
+                    "along the observation's axes: env.action.mode plane or waypoint"
+                )
+            numbers = spec.shapes["frontiers"][1]
+            self.choice = ChoiceHead(numbers, self.feature_size, hidden // 2)
+        self.taken_size = action_size if self.choice is None else 1
         self.log_std = nn.Parameter(torch.full((action_size,), settings.log_std))
         memory = self.gated or self.stack
         self.state_size = 0 if memory is None else memory.size
@@ -113,11 +133,43 @@ class Actor(Computing):
                 else:
                     features, state = self.gated.sequence(features, state, starts)
         features = features.float()
+        if self.choice is not None:
+            scores = self.choice(seen["frontiers"], features)
+            return Decisions(self.flown(seen, scores.argmax(dim=1, keepdim=True)), features, state, scores)
         wanted = self.mean(features)
         if self.steering is not None:
             steered = direction.float() * self.steering
             wanted = wanted + nn.functional.pad(steered, (0, self.action_size - steered.shape[1]))
         return Decisions(torch.tanh(wanted), features, state)
+
+    def draw(self, decisions: Decisions, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return what is done in training, `[rows, taken size]`, and its log density, `[rows]`.
+
+        It is an action, or the number of a frontier; `flown` makes either an action.
+        """
+        if decisions.scores is not None:
+            choice = draw_choice(decisions.scores, generator)
+            return choice.unsqueeze(1).float(), choice_log_probability(decisions.scores, choice)
+        noise = torch.randn(decisions.mean.shape, generator=generator).to(decisions.mean.device)
+        taken = decisions.mean + self.spread().exp() * noise
+        return taken, self.log_probability(decisions.mean, None, taken)
+
+    def flown(self, seen: Seen, taken: Tensor) -> Tensor:
+        """Return the actions, `[rows, action size]`, that what was drawn stands for."""
+        if self.choice is None:
+            return taken
+        direction = direction_of(seen["frontiers"], taken.squeeze(1).long())
+        return nn.functional.pad(direction, (0, self.action_size - 2))
+
+    def log_probability(self, mean: Tensor, scores: Tensor | None, taken: Tensor) -> Tensor:
+        """Return the log density of what was drawn, `[rows]`, by decisions' means and scores."""
+        if scores is not None:
+            return choice_log_probability(scores, taken.squeeze(1).long())
+        return log_probability(taken, mean, self.spread())
+
+    def entropy(self, scores: Tensor | None) -> Tensor:
+        """Return the mean entropy of what is drawn."""
+        return entropy(self.spread()) if scores is None else choice_entropy(scores).mean()
 
     def _level(self, seen: Seen) -> Tensor | None:
         return seen[LEVEL].to(self.dtype) if self.is_central else None

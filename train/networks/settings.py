@@ -13,6 +13,7 @@ from imagine.train.networks.gaussian import LOG_STD_RANGE
 Width = Annotated[int, Field(ge=1, le=1024)]
 ViewKind = Literal["strided", "patch"]
 LidarKind = Literal["dense", "conv1", "conv2"]
+HeadKind = Literal["gaussian", "choice"]
 MemoryKind = Literal["none", "gru", "stack"]
 EncoderKind = Literal["separate", "shared"]
 
@@ -25,6 +26,10 @@ class NetworkSettings(Settings):
     )
     encoder: EncoderKind = Field(
         default="separate", description="shared: the critic reads the actor's features, and its loss shapes them"
+    )
+    head: HeadKind = Field(
+        default="gaussian",
+        description="gaussian: a mean action, drawn around; choice: one of the frontiers seen, and the way to it",
     )
     memory: MemoryKind = Field(
         default="none", description="of the actor: a gated recurrent unit, or the newest views through 3-D convolutions"

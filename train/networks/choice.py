@@ -1,0 +1,54 @@
+"""A policy that chooses among the frontiers it is shown and flies in the direction of its choice."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from imagine.train.networks.encoders import orthogonal
+
+_NOT_SHOWN = 1e4  # what a row without a frontier has its score lowered by
+
+
+class ChoiceHead(nn.Module):
+    """Scores each frontier, `[rows, n, numbers]`, in the light of features `[rows, features]`.
+
+    What is drawn while it learns is a frontier, not a direction: an exploring policy then tries what a planner would,
+    going elsewhere, and not to tremble on its way. All in float32: differences of scores are what is learned from.
+    """
+
+    def __init__(self, numbers: int, features: int, hidden: int) -> None:
+        super().__init__()
+        self.features = orthogonal(nn.Linear(features, hidden))
+        self.each = orthogonal(nn.Linear(numbers, hidden))
+        self.mixed = orthogonal(nn.Linear(hidden, hidden))
+        self.score = orthogonal(nn.Linear(hidden, 1), gain=0.1)  # begin undecided
+
+    def forward(self, frontiers: Tensor, features: Tensor) -> Tensor:
+        """Return scores, `[rows, n]`, far below all others where no frontier is shown."""
+        hidden = torch.relu(self.each(frontiers) + self.features(features).unsqueeze(1))
+        hidden = torch.relu(self.mixed(hidden))
+        scores: Tensor = self.score(hidden).squeeze(2)
+        return scores + (frontiers[..., 0] - 1.0) * _NOT_SHOWN
+
+
+def direction_of(frontiers: Tensor, choice: Tensor) -> Tensor:
+    """Return the directions, `[rows, 2]`, of chosen frontiers, `choice` int64 `[rows]`; zeros where none is shown."""
+    at = choice.view(-1, 1, 1).expand(-1, 1, 2)
+    return frontiers[..., 1:3].gather(1, at).squeeze(1)
+
+
+def draw_choice(scores: Tensor, generator: torch.Generator) -> Tensor:
+    """Return choices, int64 `[rows]`, drawn by the softmax of scores, on the scores' device."""
+    return torch.multinomial(torch.softmax(scores, dim=1).cpu(), 1, generator=generator).squeeze(1).to(scores.device)
+
+
+def choice_log_probability(scores: Tensor, choice: Tensor) -> Tensor:
+    """Return the logarithm of the chance of choices int64 `[rows]`, `[rows]`."""
+    return torch.log_softmax(scores, dim=1).gather(1, choice.unsqueeze(1)).squeeze(1)
+
+
+def choice_entropy(scores: Tensor) -> Tensor:
+    """Return the entropy of each choice, `[rows]`."""
+    log = torch.log_softmax(scores, dim=1)
+    return -(log.exp() * log).sum(dim=1)
