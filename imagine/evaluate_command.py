@@ -93,10 +93,11 @@ def _comparison(options: EvaluateOptions) -> Comparison:
     contenders, reference = reference_of(named, options.against, options.seed)
     envs = shared_envs(contenders, options.overrides)
     kept = within_area(levels, options.max_area_m2)
-    if options.max_area_m2 is not None:
-        _say(f"{len(kept)} of {len(levels)} levels have at most {options.max_area_m2:g} m² of free space")
     plan = Plan(tuple(kept), tuple(sizes), tuple(protocols), options.episodes, options.seed, launch)
-    return Comparison(contenders, envs, plan, reference)
+    comparison = Comparison(contenders, envs, plan, reference)
+    if options.max_area_m2 is not None:  # not before: what is refused is refused in one line
+        _say(f"{len(kept)} of {len(levels)} levels have at most {options.max_area_m2:g} m² of free space")
+    return comparison
 
 
 def _check_files(options: EvaluateOptions) -> None:

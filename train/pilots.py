@@ -55,7 +55,7 @@ class RandomPilot:
         return np.stack([rng.uniform(-1.0, 1.0, shape).astype(np.float32) for rng in self._generators])
 
 
-class FrontierPilot:
+class RescuePilot:
     """The planner that also rescues in flight: each drone descends its own belief's frontier field."""
 
     name = "frontier"

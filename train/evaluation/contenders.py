@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from imagine.core.errors import InputError
 from imagine.onboard.settings import DEFAULT_POLICY
 from imagine.sim.exploration_settings import ExplorationSettings
-from imagine.train.pilots import FrontierPilot, Pilot, RandomPilot
+from imagine.train.pilots import Pilot, RandomPilot, RescuePilot
 from imagine.train.policies import Policy, PolicyPilot, load_policy
 
-BASELINES = ("random", "frontier", "coordinated", "hungarian")
+_PACKAGE = "imagine.train.baselines"
 _STRONGEST = ("coordinated", "frontier")  # which to compare with where none is named, the first that there is
 
 
@@ -40,25 +40,23 @@ class Contender:
         return self.env is None
 
 
-def baseline_names() -> tuple[str, ...]:
-    """Return the baselines that this version has."""
-    return BASELINES if importlib.util.find_spec(_PACKAGE) is not None else BASELINES[:2]
-
-
-_PACKAGE = "imagine.train.baselines"
-
-
 def baseline_pilot(name: str, seed: int) -> Pilot:
     """Return a baseline by its name; this is the one place that knows where they come from. Raises InputError."""
     if importlib.util.find_spec(_PACKAGE) is not None:
-        package: Any = importlib.import_module(_PACKAGE)
-        pilot: Pilot = package.baseline(name, seed)
+        pilot: Pilot = importlib.import_module(_PACKAGE).baseline(name, seed)
         return pilot
     if name == "random":
         return RandomPilot(np.random.default_rng(seed))
     if name == "frontier":
-        return FrontierPilot()
+        return RescuePilot()
     raise InputError(f"{name}: no such baseline; there are {', '.join(baseline_names())}")
+
+
+def baseline_names() -> tuple[str, ...]:
+    """Return the names of the baselines that there are."""
+    if importlib.util.find_spec(_PACKAGE) is None:
+        return ("random", "frontier")
+    return tuple(importlib.import_module(_PACKAGE).BASELINES)
 
 
 def strongest_baseline() -> str:
@@ -119,8 +117,8 @@ def reference_of(
     """Return who flies, and which of them the others are compared with; None where one flies alone.
 
     `against` names one of the contenders, or else anyone, who then flies as well. Without it the last baseline is the
-    reference (chance only where there is no planner); where several networks and no baseline are given, the strongest baseline flies as well. Raises
-    InputError on an unknown name.
+    reference (chance only where there is no planner); where several networks and no baseline are given, the strongest
+    baseline flies as well. Raises InputError on an unknown name.
     """
     flown = list(contenders)
     if against is None and len(flown) < 2:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#
 """Okabe and Ito's palette, told apart by colour-blind eyes, the strongest on white first."""
 _REFERENCE = "#7A7A7A"
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)))
+_LETTERS_AN_INCH = 13.5  # of the line under a title
 _RESAMPLES = 400  # of whole curves, for bands: enough for what a pixel shows
 
 
@@ -70,7 +72,9 @@ def coverage_figure(comparison: Comparison, group: Group) -> Figure:
     levels = panels_of(comparison)
     columns = min(4, len(levels))
     rows = math.ceil(len(levels) / columns)
-    figure = _figure(3.1 * columns + 0.6, 2.7 * rows + 1.0, "Coverage over time", comparison, group)
+    figure = _figure(
+        3.1 * columns + 0.6, 2.7 * rows + 1.0, "Coverage over time", comparison, group, "mean and its 95 % interval"
+    )
     panels = np.atleast_1d(figure.subplots(rows, columns, sharey=True, squeeze=False)).ravel()
     for panel, level in zip(panels, levels, strict=False):
         flown = [comparison.episodes(who, group, level) for who in range(len(comparison.contenders))]
@@ -83,7 +87,7 @@ def coverage_figure(comparison: Comparison, group: Group) -> Figure:
             panel.fill_between(seconds, low, high, color=colour, alpha=0.18, lw=0)
             panel.plot(seconds, mean, color=colour, ls=dash, lw=1.8, label=comparison.contenders[who].name)
         panel.axhline(0.9, color="#bbbbbb", lw=0.8, zorder=0)
-        panel.set_xlim(0, longest * TICK_S)
+        panel.set_xlim(0, telling_ticks([held_curves(episodes, longest) for episodes in flown]) * TICK_S)
         panel.set_ylim(0, 1.02)
         panel.set_title(_level_title(comparison, level), fontsize=10, loc="left")
         _plain(panel)
@@ -138,7 +142,7 @@ def t90_figure(comparison: Comparison, group: Group) -> Figure:
     if comparison.reference is not None:
         name = comparison.contenders[comparison.reference].name
         axes.text(
-            1.0, 1.01, f"×: mean time per that of {name}, same episodes", transform=axes.transAxes, ha="right",
+            1.0, 1.01, f"×: mean time relative to {name} in the same episodes", transform=axes.transAxes, ha="right",
             fontsize=8, color="#555555",
         )  # fmt: skip
     _legend(figure, axes)
@@ -149,20 +153,25 @@ def radar_figure(comparison: Comparison, group: Group) -> Figure:
     """Return a radar of six qualities over all levels, 0 at the centre and 1 outside; see `radar.radar_of`."""
     level = ALL_LEVELS if len(comparison.plan.levels) > 1 else comparison.plan.levels[0]
     rows = [row for row in comparison.rows if _belongs(row, group) and row["level"] == level]
-    figure = _figure(6.0, 6.2, "What else counts, outside is better", comparison, group)
+    figure = _figure(
+        6.0, 6.2, "Six qualities, outside is better", comparison, group, "speed and bytes relative to the best shown"
+    )
     axes = figure.add_subplot(polar=True)
     angles = np.linspace(0.0, 2.0 * np.pi, len(AXES), endpoint=False)
     for who, values in enumerate(radar_of(rows)):
         colour, dash = _style(comparison, who)
         loop = np.append(values, values[0])
         axes.plot([*angles, angles[0]], loop, color=colour, ls=dash, lw=1.8, label=rows[who]["policy"])
-        axes.fill([*angles, angles[0]], loop, color=colour, alpha=0.08)
+        axes.fill([*angles, angles[0]], loop, color=colour, alpha=0.05)
     set_up: Any = axes
     set_up.set_theta_offset(np.pi / 2)
     set_up.set_theta_direction(-1)
     set_up.set_rlabel_position(30)
     axes.set_xticks(angles, AXES, fontsize=9)
-    axes.tick_params(axis="x", pad=14)
+    for angle, text in zip(angles, axes.get_xticklabels(), strict=True):  # outwards from the ring, clear of it
+        text.set_horizontalalignment(
+            "center" if np.isclose(np.sin(angle), 0.0) else "left" if angle < np.pi else "right"
+        )
     axes.set_ylim(0, 1)
     axes.set_yticks([0.25, 0.5, 0.75, 1.0], ["", "0.5", "", "1"], fontsize=7, color="#777777")
     axes.grid(color="#dddddd")
@@ -175,6 +184,17 @@ def panels_of(comparison: Comparison) -> list[str]:
     """Return the levels that get a panel each; all together where they are too many."""
     levels = list(comparison.plan.levels)
     return levels if len(levels) <= _MOST_PANELS else [ALL_LEVELS]
+
+
+def telling_ticks(flown: Sequence[NDArray[np.float32]]) -> int:
+    """Return how many ticks of everyone's curves, each `[episodes, ticks]`, are worth showing.
+
+    That is until the last of those who see nearly all has done so; those who never do would leave the others a margin.
+    """
+    means = [curves.mean(axis=0) for curves in flown]
+    settled = [int(np.argmax(mean >= mean[-1] - 0.003)) + 1 for mean in means if mean[-1] >= 0.9]
+    longest = len(means[0])
+    return min(longest, round(1.15 * max(settled)) + 1) if settled else longest
 
 
 def curve_band(curves: NDArray[np.float32], seed: int) -> tuple[NDArray[np.float64], ...]:
@@ -208,7 +228,7 @@ def _style(comparison: Comparison, who: int) -> tuple[str, Any]:
     return _COLOURS[place % len(_COLOURS)], _DASHES[place % len(_DASHES)]
 
 
-def _figure(width: float, height: float, title: str, comparison: Comparison, group: Group) -> Figure:
+def _figure(width: float, height: float, title: str, comparison: Comparison, group: Group, note: str = "") -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -217,9 +237,14 @@ def _figure(width: float, height: float, title: str, comparison: Comparison, gro
     plan = comparison.plan
     team = "1 drone" if group.drones == 1 else f"{group.drones} drones"
     launch = ", random launches" if plan.launch == "random" else ""
-    under = f"{team}, {group.protocol}, {plan.episodes} episodes a level{launch}"
-    figure.suptitle(f"{title}\n", x=0.01, ha="left", fontsize=12, fontweight="bold")
-    figure.text(0.01, 1.0 - 0.42 / height, under, ha="left", va="center", fontsize=9, color="#555555")
+    words = [f"{team}, {group.protocol}, {plan.episodes} episodes a level{launch}", *([note] if note else [])]
+    joined = "; ".join(words)
+    lines = [joined] if len(joined) <= _LETTERS_AN_INCH * width else words
+    figure.suptitle(title + "\n" * len(lines), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    for number, line in enumerate(lines):
+        figure.text(
+            0.01, 1.0 - (0.42 + 0.18 * number) / height, line, ha="left", va="center", fontsize=9, color="#555555"
+        )
     return figure
 
 
