@@ -72,9 +72,8 @@ def coverage_figure(comparison: Comparison, group: Group) -> Figure:
     levels = panels_of(comparison)
     columns = min(4, len(levels))
     rows = math.ceil(len(levels) / columns)
-    figure = _figure(
-        3.1 * columns + 0.6, 2.7 * rows + 1.0, "Coverage over time", comparison, group, "mean and its 95 % interval"
-    )
+    size = (3.1 * columns + 0.6, 2.7 * rows + 1.0) if len(levels) > 1 else (6.0, 4.4)
+    figure = _figure(*size, "Coverage over time", comparison, group, "mean and its 95 % interval")
     panels = np.atleast_1d(figure.subplots(rows, columns, sharey=True, squeeze=False)).ravel()
     for panel, level in zip(panels, levels, strict=False):
         flown = [comparison.episodes(who, group, level) for who in range(len(comparison.contenders))]
