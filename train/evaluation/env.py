@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from pydantic import Field
 
 from imagine.core.config import Settings, apply_overrides, check_settings
+from imagine.core.contract import ActionSpec
 from imagine.core.errors import InputError
+from imagine.core.observation_spec import ObservationSpec
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.evaluation.contenders import Contender
 
@@ -51,14 +53,19 @@ def evaluation_env(contender: Contender, overrides: Sequence[str] = ()) -> Explo
 def shared_envs(contenders: Sequence[Contender], overrides: Sequence[str] = ()) -> list[ExplorationSettings]:
     """Return an environment for each contender, alike in everything but what a policy sees and how it acts.
 
-    The first network's is everyone's; planners act as it does. Raises InputError as `evaluation_env` does, and where
+    The first network's is everyone's. Planners need no observation, and decide anew in every tick, which suits them
+    best, at the network's speed. Raises InputError as `evaluation_env` does, and where
     networks were made for drones of different sensors, maps or limits: then their episodes could not be the same.
     """
     networks = [contender for contender in contenders if not contender.is_baseline]
     base = evaluation_env(networks[0] if networks else contenders[0], overrides)
     envs = []
     for contender in contenders:
-        if contender.env is None or contender is networks[0]:
+        if contender.env is None and networks:
+            action = ActionSpec(speed_mps=base.action.speed_mps)
+            envs.append(base.model_copy(update={"action": action, "observation": ObservationSpec()}))
+            continue
+        if not networks or contender is networks[0]:
             envs.append(base)
             continue
         own = evaluation_env(contender, overrides)
