@@ -25,7 +25,8 @@ Phase = Literal["imitation", "ppo"]
 
 @dataclass
 class Checkpoint:
-    """The state of a run. Weights and optimisers are torch state dicts; `env` is the environment's own state.
+    """The state of a run. Weights and optimisers are torch state dicts; `env` is the environment's own state,
+    `progress` that of the curriculum, of recent episodes and of what drones remember.
 
     `agent_steps` counts decisions by phase, `wall_s` the seconds of training so far.
     """
@@ -40,6 +41,7 @@ class Checkpoint:
     optimisers: dict[str, dict[str, Any]]
     rngs: dict[str, Any]
     env: Any = None
+    progress: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
 
 
@@ -50,6 +52,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     content["record"] = json.dumps(checkpoint.record)
     content["rngs"] = pack(checkpoint.rngs)
     content["env"] = pack(checkpoint.env)
+    content["progress"] = pack(checkpoint.progress)
     content["format"] = FORMAT
     write_atomically(path, lambda temporary: torch.save(content, temporary))
 
@@ -77,6 +80,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
             "record": json.loads(content["record"]),
             "rngs": unpack(content["rngs"]),
             "env": unpack(content["env"]),
+            "progress": unpack(content["progress"]),
         }
     )
 

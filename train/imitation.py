@@ -116,8 +116,8 @@ def imitation_loss(mean: Tensor, labels: Tensor, cosine_weight: float) -> Tensor
 def choice_loss(scores: Tensor, frontiers: Tensor, labels: Tensor) -> Tensor:
     """Return the cross-entropy of choices to the frontiers that lie in the direction of the labels.
 
-    `scores` `[rows, n]`, `frontiers` `[rows, n, numbers]`, `labels` `[rows, action size]`. Frontiers that begin with the
-    same way are one to a label, so its weight is shared among them; labels that point at none count for nothing.
+    `scores` `[rows, n]`, `frontiers` `[rows, n, numbers]`, `labels` `[rows, action size]`. Frontiers that begin with
+    the same way are one to a label, so its weight is shared among them; labels that point at none count for nothing.
     """
     frontiers, labels = frontiers.float(), labels[:, None, :2]
     cosine = nn.functional.cosine_similarity(frontiers[..., 1:3], labels, dim=2, eps=1e-3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 
@@ -25,6 +26,7 @@ class RunSettings(Settings):
     root: str = Field(default="runs", description="folder of run folders")
     seed: int = Field(default=0, ge=0)
     threads: int | None = Field(default=None, ge=1, description="of torch; none: one for each core")
+    device: Literal["auto", "cpu", "cuda"] = Field(default="auto", description="of the networks; auto: cuda if found")
     checkpoint_every_s: float = Field(default=60.0, gt=0.0)
     keep_checkpoints: int = Field(default=3, ge=1, description="numbered checkpoints kept beside the latest")
     final_episodes: int = Field(default=8, ge=0, description="evaluated on each level at the end; 0: none")

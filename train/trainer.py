@@ -2,40 +2,39 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import logging
 import os
-import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
-import numpy as np
 import torch
 
-from imagine.core.errors import InputError
+from imagine.core.errors import InputError, WorkError
 from imagine.sim.exploration import Exploration
+from imagine.sim.level_names import PREFIX
 from imagine.train.atomic_file import write_atomically
 from imagine.train.baselines import baseline
-from imagine.train.checkpoint import Checkpoint, Phase, check_same_network, load_checkpoint, load_weights
+from imagine.train.checkpoint import Checkpoint, Phase, check_same_network, load_checkpoint
 from imagine.train.curriculum import Curriculum
 from imagine.train.evaluation import evaluate
 from imagine.train.imitation import collect_labels, label_buffer, learn
-from imagine.train.networks import Actor, Critic, steers
+from imagine.train.learner import Learner
 from imagine.train.policies import policy_of
-from imagine.train.ppo import Optimisers, update
+from imagine.train.ppo import update
 from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
 from imagine.train.rollout import Recall, collect
 from imagine.train.run_folder import RunFolder, run_record
 from imagine.train.settings import TrainSettings, load_train_settings
+from imagine.train.stopping import stop_requests
 
 logger = logging.getLogger(__name__)
+
+_MOST_HOUSES = 5
 
 
 @dataclass(frozen=True)
@@ -60,20 +59,18 @@ def train(
     SIGINT and SIGTERM end it cleanly after the update in progress, with a checkpoint. Raises InputError for bad
     settings or checkpoints, WorkError when training diverges or the disk is full.
     """
-    checkpoint = None
-    if resume is not None:
+    if resume is None:
+        settings = load_train_settings(config, overrides)
+        trainer = Trainer(settings)
+        folder = RunFolder.create(settings)
+    else:
         if config is not None:
             raise InputError("a resumed run has its configuration already: give CONFIG or --resume, not both")
-        checkpoint = load_checkpoint(resume)
-        settings = load_train_settings(_run_path(resume) / "config.yaml", overrides)
-    else:
-        settings = load_train_settings(config, overrides)
-    trainer = Trainer(settings, checkpoint)
-    folder = (
-        RunFolder.create(settings)
-        if resume is None or checkpoint is None
-        else RunFolder.reopen(_run_path(resume), sum(checkpoint.agent_steps.values()), settings)
-    )
+        run = resume if resume.is_dir() else resume.parent.parent
+        settings = load_train_settings(run / "config.yaml", overrides)
+        checkpoint = None if _is_before_its_first_checkpoint(resume) else load_checkpoint(resume)
+        trainer = Trainer(settings, checkpoint)
+        folder = RunFolder.reopen(run, 0 if checkpoint is None else sum(checkpoint.agent_steps.values()), settings)
     try:
         with stop_requests() as stop:
             return trainer.run(folder, report or LogReporter(), stop)
@@ -81,48 +78,9 @@ def train(
         folder.close()
 
 
-def _run_path(resume: Path) -> Path:
-    """Return the run folder of a folder or of a checkpoint file inside one."""
-    return resume if resume.is_dir() else resume.parent.parent
-
-
-@dataclass
-class Learner:
-    """All that learns and all that is random in a run, but for the environment."""
-
-    actor: Actor
-    critic: Critic
-    ppo: Optimisers
-    imitation: torch.optim.Optimizer
-    generator: torch.Generator
-    rng: np.random.Generator
-
-    @staticmethod
-    def create(settings: TrainSettings) -> Learner:
-        """Return a fresh learner; the seed decides its weights and draws."""
-        torch.manual_seed(settings.run.seed)  # layers initialise from the global generator
-        observation, action = settings.env.observation, settings.env.action
-        actor = Actor(settings.network, observation, action.size, steers(observation, action))
-        critic = Critic(settings.network, observation)
-        return Learner(
-            actor,
-            critic,
-            Optimisers(actor, critic),
-            torch.optim.Adam(actor.parameters(), lr=settings.imitation.lr),
-            torch.Generator().manual_seed(settings.run.seed),
-            np.random.default_rng(settings.run.seed),
-        )
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint. Raises InputError when it is of another network."""
-        load_weights(self.actor, checkpoint.actor, "checkpoint: actor")
-        load_weights(self.critic, checkpoint.critic, "checkpoint: critic")
-        optimisers = copy.deepcopy(checkpoint.optimisers)  # Adam would go on in the checkpoint's own tensors
-        self.ppo.actor.load_state_dict(optimisers["actor"])
-        self.ppo.critic.load_state_dict(optimisers["critic"])
-        self.imitation.load_state_dict(optimisers["imitation"])
-        self.generator.set_state(checkpoint.rngs["torch"])
-        self.rng.bit_generator.state = checkpoint.rngs["numpy"]
+def _is_before_its_first_checkpoint(resume: Path) -> bool:
+    """Tell whether a run's folder holds no checkpoint yet: it was stopped while it imitated, and begins anew."""
+    return (resume / "config.yaml").exists() and not (resume / "checkpoints" / "latest.pt").exists()
 
 
 @dataclass
@@ -137,12 +95,14 @@ class Trainer:
 
     def __post_init__(self) -> None:
         self.curriculum = Curriculum(self.settings.curriculum, self.settings.env)
-        if self.resumed is not None and "curriculum" in self.resumed.record:
-            self.curriculum.load_state_dict(self.resumed.record["curriculum"])
-        self.env = Exploration(self.curriculum.environment, self.settings.run.seed)
         if self.resumed is not None:
+            self.curriculum.load_state_dict(self.resumed.progress["curriculum"])
+        self.env = Exploration(self.curriculum.environment, self.settings.run.seed)
+        if self.resumed is None:
+            self._observation = self.env.reset()
+        else:
             self.env.load_state_dict(self.resumed.env)
-        self._observation = self.env.reset()
+            self._observation = self.env.observation()
         # Set here, whatever OMP_NUM_THREADS says: sums are split by thread, and equal settings must give equal runs.
         torch.set_num_threads(self.settings.run.threads or len(os.sched_getaffinity(0)))
         self.learner = Learner.create(self.settings)
@@ -155,17 +115,32 @@ class Trainer:
             self.agent_steps = dict(self.resumed.agent_steps)
             self.updates, self.phase = self.resumed.updates, self.resumed.phase
             self._wall_before_s = self.resumed.wall_s
+            self.episodes.load_state_dict(self.resumed.progress["episodes"])
+            kept, device = self.resumed.progress["recall"], self.learner.actor.device
+            self._recall = Recall(kept["state"].to(device), kept["starts"].to(device))
 
     def run(self, folder: RunFolder, report: Reporter, stop: threading.Event) -> RunResult:
-        """Train until both phases are done or `stop` is set; leave a checkpoint either way."""
+        """Train until both phases are done or `stop` is set; leave a checkpoint either way.
+
+        But for a stop in the first phase: it takes minutes, its labels are many times the size of a checkpoint, and a
+        run that is resumed there begins anew, and so comes to the same. Raises WorkError where training diverges,
+        naming the last good checkpoint.
+        """
         self._folder, self._report, self._stop = folder, report, stop
         self._began = self._saved = time.monotonic()
-        if self.phase == "imitation":
-            self._imitate()
-        if self.phase == "ppo":
-            self._improve()
+        latest = folder.checkpoints / "latest.pt"
+        try:
+            if self.phase == "imitation":
+                self._imitate()
+            if self.phase == "ppo":
+                self._improve()
+        except WorkError as error:
+            where = f"; the last good checkpoint is {latest}" if latest.exists() else ""
+            raise WorkError(f"{error}{where}") from error
         finished = not stop.is_set()
-        checkpoint = folder.save(self.checkpoint(), "final" if finished else None)
+        checkpoint = latest
+        if self.phase == "ppo":
+            checkpoint = folder.save(self.checkpoint(), "final" if finished else None)
         if finished and self.settings.run.final_episodes:
             self._evaluate(checkpoint)
         return RunResult(folder.path, checkpoint, sum(self.agent_steps.values()), finished, self.episodes.means())
@@ -239,13 +214,14 @@ class Trainer:
             numbers=numbers,
             levels=self.episodes.means(),
             drones=self.episodes.drone_means(),
+            paradigm=self.settings.network.paradigm,
             steps_per_s=steps / sum(seconds.values()),
             seconds=seconds,
             wall_s=self._wall_s(),
         )
         self._folder.log(report.agent_steps, {**report.scalars(), **self.curriculum.scalars()})
         self._report(report)
-        if time.monotonic() - self._saved >= self.settings.run.checkpoint_every_s:
+        if self.phase == "ppo" and time.monotonic() - self._saved >= self.settings.run.checkpoint_every_s:
             self._saved = time.monotonic()
             self._folder.save(self.checkpoint())
 
@@ -260,18 +236,15 @@ class Trainer:
             wall_s=self._wall_s(),
             actor=learner.actor.state_dict(),
             critic=learner.critic.state_dict(),
-            optimisers={
-                "actor": learner.ppo.actor.state_dict(),
-                "critic": learner.ppo.critic.state_dict(),
-                "imitation": learner.imitation.state_dict(),
-            },
-            rngs={"torch": learner.generator.get_state(), "numpy": learner.rng.bit_generator.state},
+            optimisers=learner.optimiser_states(),
+            rngs=learner.draws(),
             env=self.env.state_dict(),
-            record={
-                **run_record(self.settings),
-                "levels": self.episodes.summary(),
+            progress={
+                "episodes": self.episodes.state_dict(),
                 "curriculum": self.curriculum.state_dict(),
+                "recall": {"state": self._recall.state.cpu(), "starts": self._recall.starts.cpu()},
             },
+            record={**run_record(self.settings), "levels": self.episodes.summary()},
         )
 
     def _evaluate(self, checkpoint: Path) -> None:
@@ -279,7 +252,7 @@ class Trainer:
         settings = self.settings
         rows = evaluate(
             policy_of(self.learner.actor, settings.run.name),
-            levels=sorted(set(self.curriculum.levels)),
+            levels=evaluated_levels(self.curriculum.levels),
             drones=(settings.env.drones,),
             protocol=settings.env.protocol,
             episodes=settings.run.final_episodes,
@@ -293,26 +266,7 @@ class Trainer:
         return self._wall_before_s + time.monotonic() - self._began
 
 
-@contextmanager
-def stop_requests() -> Iterator[threading.Event]:
-    """Turn the first SIGINT or SIGTERM into an event, so that the work in progress ends well; the second one kills.
-
-    Outside the main thread, where Python takes no signals, the event is simply never set.
-    """
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-
-    def ask(number: int, _frame: FrameType | None) -> None:
-        stop.set()
-        signal.signal(number, before[signal.Signals(number)])
-
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    for number in before:
-        signal.signal(number, ask)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def evaluated_levels(levels: Sequence[str]) -> list[str]:
+    """Return those of a run's levels that are flown at its end: all, but of generated houses only the first few."""
+    houses = [level for level in levels if level.startswith(PREFIX)]
+    return sorted({level for level in levels if level not in houses} | set(houses[:_MOST_HOUSES]))

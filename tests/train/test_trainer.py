@@ -11,10 +11,11 @@ import yaml
 
 from imagine.core.errors import InputError
 from imagine.train.checkpoint import load_checkpoint
+from imagine.train.learner import Learner
 from imagine.train.ppo import update
 from imagine.train.rollout import collect
 from imagine.train.settings import load_train_settings
-from imagine.train.trainer import Learner, Trainer, train
+from imagine.train.trainer import Trainer, train
 
 TINY = (
     "env.worlds=2", "env.episode_ticks=40", "env.observation.view_cells=16", "env.observation.lidar_sectors=16",

@@ -45,8 +45,8 @@ class Actor(Computing):
     """The policy that all drones share; the spread of its actions is one number per component.
 
     `inputs` and `outputs` name what `forward` takes and gives, which is what an exported model takes and gives:
-    `views`, `lidar`, `motion`, `frontiers` where they are seen, then `level` under ctce and `state` where there is a memory; `action`, then
-    `next_state`. `state_size` is 0 without memory.
+    `views`, `lidar`, `motion`, `frontiers` where they are seen, then `level` under ctce and `state` where there is a
+    memory; `action`, then `next_state`. `state_size` is 0 without memory.
     """
 
     def __init__(self, settings: NetworkSettings, spec: ObservationSpec, action_size: int, steers: bool = True) -> None:

@@ -139,7 +139,7 @@ class LevelEncoder(nn.Module):
 
 
 class FrontierEncoder(nn.Module):
-    """Scores the frontiers that are shown, `[batch, n, numbers]`, in the light of the rest, and mixes them by a softmax.
+    """Scores the frontiers shown, `[batch, n, numbers]`, in the light of the rest, and mixes them by a softmax.
 
     Frontiers are a set: whatever their order, the same numbers score the same.
     """
