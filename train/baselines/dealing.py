@@ -7,35 +7,49 @@ import math
 import numba
 import numpy as np
 
-from imagine.train.baselines.survey import distance_m, in_sight
+from imagine.train.baselines.survey import claim, expected_gain
+
+LEAST_UTILITY = 1e-6
+"""Utility of what shows nothing: the way decides among such targets."""
 
 
 @numba.njit(cache=True, nogil=True)
-def coordinated_target(ways, utility, targets, states, robots, count, options):  # type: ignore[no-untyped-def]
+def coordinated_target(ways, utility, targets, states, robots, count, left, rays, options):  # type: ignore[no-untyped-def]
     """Return the index of the target that robot 0 gets in the greedy dealing of Burgard et al. (2005); -1 for none.
 
-    Robot and target of the greatest worth, utility less weighted way, come first; then what can be seen from that
-    target is worth less to all others, in proportion to how near it is. `ways` float64 `[robots, targets]` metres,
-    inf where there is none; `utility` float64 `[targets]` is overwritten; `options` (cost weight, logarithmic,
-    discount range).
+    Robot and target of the greatest worth, utility less weighted way, come first; what can be seen from that target is
+    then worth less to all others. `ways` float64 `[robots, targets]` metres, inf where there is none; `utility`
+    float64 `[targets]` and `left` (float32, of the grid's shape, see `expected_gain`) are overwritten; `options` are
+    (cost weight, form, gain exponent, gain reach in cells, share that is taken off).
     """
-    weight, logarithmic, discount_range = options
-    columns = states.shape[1]
+    weight, form, exponent, reach, share = options
     served = np.zeros(robots, np.bool_)
+    left[:] = np.float32(1.0)
     for _ in range(robots):
         best, best_robot, best_target = -np.inf, -1, -1
         for target in range(count):
-            worth = math.log(max(utility[target], 1e-9)) if logarithmic else utility[target]
             for robot in range(robots):
-                if not served[robot] and ways[robot, target] < np.inf and worth - weight * ways[robot, target] > best:
-                    best, best_robot, best_target = worth - weight * ways[robot, target], robot, target
+                if served[robot] or ways[robot, target] == np.inf:
+                    continue
+                worth = worth_of(utility[target], weight * ways[robot, target], form)
+                if worth > best:
+                    best, best_robot, best_target = worth, robot, target
         if best_robot <= 0:
             return best_target
         served[best_robot] = True
-        for target in range(count):
-            apart = distance_m(targets[target], targets[best_target], columns)
-            if target == best_target:
-                utility[target] = 0.0
-            elif apart < discount_range and in_sight(states, targets[best_target], targets[target]):
-                utility[target] *= apart / discount_range
+        if share > 0.0:
+            claim(left, states, targets[best_target], reach, rays, share)
+            for target in range(count):
+                if utility[target] > 0.0:
+                    utility[target] = expected_gain(states, left, targets[target], reach, rays) ** exponent
+        utility[best_target] = 0.0
     return -1
+
+
+@numba.njit(cache=True, nogil=True)
+def worth_of(utility, cost, form):  # type: ignore[no-untyped-def]
+    """Return what a target of this utility is worth at this weighted way, by `Parameters.form`."""
+    if form == 0:
+        return utility - cost
+    utility = max(utility, LEAST_UTILITY)
+    return math.log(utility) - cost if form == 1 else math.log(utility) - math.log(max(1.0 + cost, 0.01))
