@@ -13,18 +13,19 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.dealing import deal
+from imagine.core.dealing import deal, worth_of
 from imagine.core.frontier import PAD, PLAN_CELL, UNIT_M
 from imagine.core.frontier_paths import FAR, search_scratch
 from imagine.core.frontier_targets import MOST_TARGETS, expected_gain, fill_ways, find_targets, gain_rays, nearest_open
 from imagine.core.frontier_ways import follow, trace_back
 
-FRONTIER_NUMBERS = 12
+FRONTIER_NUMBERS = 14
 """Numbers for each frontier shown, see `fill_frontiers`."""
 _WAY_M, _OFFSET_M, _MOST = 10.0, 10.0, 3.0
 _CLUSTER_CELLS = 6  # 1.2 m
-_GAIN_M = 4.0
-_COST_PER_M = 0.1  # of utility, as the coordinated planner weighs a way
+_NEAR_CELLS, _FAR_CELLS = 20, 40  # what may be seen: at a target, 4 m around it, and where it leads, 8 m
+_COST_PER_M = 0.1  # of the logarithm of what is seen, as the coordinated planner weighs a way
+_RAYS = 32
 _OWN_RINGS, _PEER_RINGS = 4, 12
 _PATH_CELLS = 512
 
@@ -39,6 +40,7 @@ class ChoiceScratch(NamedTuple):
     search: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]
     targets: NDArray[np.int32]
     path: NDArray[np.int32]
+    left: NDArray[np.float32]
     rays: NDArray[np.float64]
     nobody: NDArray[np.int32]
 
@@ -49,7 +51,8 @@ def choice_scratch(rows: int, columns: int) -> ChoiceScratch:
     return ChoiceScratch(
         np.empty((rows, columns), np.int16), np.empty((rows, columns), np.int16), np.zeros(cells, np.uint8),
         np.empty(cells, np.int32), search_scratch(cells), np.empty(MOST_TARGETS, np.int32),
-        np.empty(_PATH_CELLS, np.int32), gain_rays(_GAIN_M), np.full(1, -1, np.int32),
+        np.empty(_PATH_CELLS, np.int32), np.empty((rows, columns), np.float32), gain_rays(_RAYS),
+        np.full(1, -1, np.int32),
     )  # fmt: skip
 
 
@@ -59,9 +62,10 @@ def fill_frontiers(  # type: ignore[no-untyped-def]
 ):
     """Fill `frontiers` (float32 `[n, FRONTIER_NUMBERS]`) with the n best targets of a drone at (x, y), best first.
 
-    Numbers of each: 1; the direction to fly in, a unit vector; the way there; what it may show, as a share of the
-    sensor's disc; the shortest way of a peer; the offset from the drone; whether the dealing gives it to this drone,
-    to a peer; what it is worth once the peers have theirs; how fresh the nearest peer's report is. Metres are over 10,
+    Numbers of each: 1; the direction to fly in, a unit vector; the way there; what it may show within 4 m and within
+    8 m, as shares of these discs; the ways of the nearest two peers; the offset from the drone; whether the dealing
+    gives it to this drone, to a peer; what it may show once the peers have seen theirs; how fresh the nearest peer's
+    report is. Metres are over 10,
     ways at most 3, and 3 where nobody gets there; vectors are along axes turned by `turn`. Rows beyond the targets
     there are stay 0. `kinds` and `states` are padded planning grids whose first cell is map cell (column0, row0);
     `positions`, `ages` as in `PeerPoses`, of peers heard within `memory_s`.
@@ -80,11 +84,13 @@ def fill_frontiers(  # type: ignore[no-untyped-def]
     own = scratch.own.ravel()
     peers = len(ages)
     ways, fresh = np.empty((peers + 1, count)), np.zeros(peers + 1)
-    gains, utility = np.empty(count), np.empty(count)
-    reach = round(_GAIN_M / PLAN_CELL)
+    near, far, utility = np.empty(count), np.empty(count), np.empty(count)
+    left = scratch.left
+    left[:] = np.float32(1.0)
     for k in range(count):
         ways[0, k] = own[targets[k]] * UNIT_M
-        gains[k] = utility[k] = expected_gain(states, targets[k], reach, scratch.rays)
+        near[k] = expected_gain(states, left, targets[k], _NEAR_CELLS, scratch.rays)
+        far[k] = utility[k] = expected_gain(states, left, targets[k], _FAR_CELLS, scratch.rays)
     robots = 1
     for peer in range(peers):
         if not ages[peer] < memory_s:
@@ -102,13 +108,14 @@ def fill_frontiers(  # type: ignore[no-untyped-def]
         fresh[robots] = 1.0 - max(ages[peer], 0.0) / memory_s
         robots += 1
     dealt = np.full(robots, -1)
-    deal(dealt, ways[:robots], utility, targets[:count], states, _COST_PER_M, False, _GAIN_M)
+    options = (_COST_PER_M, 1, 1.0, _FAR_CELLS, 1.0)
+    deal(dealt, ways[:robots], utility, targets[:count], states, left, scratch.rays, options)
     cos_turn, sin_turn = math.cos(turn), math.sin(turn)
     taken = np.zeros(count, np.bool_)
     for shown in range(min(len(frontiers), count)):
         best, best_worth = -1, -np.inf
         for k in range(count):
-            worth = utility[k] - _COST_PER_M * ways[0, k] + (1e6 if dealt[0] == k else 0.0)
+            worth = worth_of(utility[k], _COST_PER_M * ways[0, k], 1) + (1e6 if dealt[0] == k else 0.0)
             if not taken[k] and worth > best_worth:
                 best, best_worth = k, worth
         taken[best] = True
@@ -116,10 +123,13 @@ def fill_frontiers(  # type: ignore[no-untyped-def]
         length = trace_back(scratch.path, scratch.own, kinds, cell)
         d_row, d_column, _, _ = follow(scratch.path, length, 0, kinds, states, at_row, at_column)
         norm = max(math.sqrt(d_row * d_row + d_column * d_column), 1e-6)
-        nearest, freshness, to_peer = np.inf, 0.0, 0.0
+        nearest, second, freshness, to_peer = np.inf, np.inf, 0.0, 0.0
         for robot in range(1, robots):
             if ways[robot, best] < nearest:
+                second = nearest
                 nearest, freshness = ways[robot, best], fresh[robot]
+            else:
+                second = min(second, ways[robot, best])
             if dealt[robot] == best:
                 to_peer = 1.0
         dx = (cell % columns + 0.5 - at_column) * (PLAN_CELL / _OFFSET_M)
@@ -129,11 +139,13 @@ def fill_frontiers(  # type: ignore[no-untyped-def]
         row_out[1] = (cos_turn * d_column + sin_turn * d_row) / norm
         row_out[2] = (cos_turn * d_row - sin_turn * d_column) / norm
         row_out[3] = min(ways[0, best] / _WAY_M, _MOST)
-        row_out[4] = gains[best]
-        row_out[5] = min(nearest / _WAY_M, _MOST)
-        row_out[6] = min(max(cos_turn * dx + sin_turn * dy, -_MOST), _MOST)
-        row_out[7] = min(max(cos_turn * dy - sin_turn * dx, -_MOST), _MOST)
-        row_out[8] = 1.0 if dealt[0] == best else 0.0
-        row_out[9] = to_peer
-        row_out[10] = utility[best]
-        row_out[11] = freshness
+        row_out[4] = near[best]
+        row_out[5] = far[best]
+        row_out[6] = min(nearest / _WAY_M, _MOST)
+        row_out[7] = min(second / _WAY_M, _MOST)
+        row_out[8] = min(max(cos_turn * dx + sin_turn * dy, -_MOST), _MOST)
+        row_out[9] = min(max(cos_turn * dy - sin_turn * dx, -_MOST), _MOST)
+        row_out[10] = 1.0 if dealt[0] == best else 0.0
+        row_out[11] = to_peer
+        row_out[12] = utility[best]
+        row_out[13] = freshness

@@ -16,7 +16,7 @@ from imagine.core.frontier_paths import BLOCKED, FAR, FRONTIER, OPEN, settle
 
 MOST_TARGETS = 96
 """Clusters that are considered; what lies beyond, in the order of the grid, waits until others are gone."""
-GAIN_RAYS = 48
+GAIN_RAYS = 64
 
 
 @numba.njit(cache=True, nogil=True)
@@ -112,45 +112,45 @@ def _is_banned(banned, row, column, columns):  # type: ignore[no-untyped-def]
     return False
 
 
-def gain_rays(range_m: float) -> NDArray[np.float64]:
-    """Return the directions that gain is looked for in, float64 `[GAIN_RAYS, 2]` (rows, columns a planning cell)."""
-    bearing = (np.arange(GAIN_RAYS) + 0.5) * (2.0 * math.pi / GAIN_RAYS)
+def gain_rays(count: int = GAIN_RAYS) -> NDArray[np.float64]:
+    """Return the directions that gain is looked for in, float64 `[count, 2]` (rows, columns a planning cell)."""
+    bearing = (np.arange(count) + 0.5) * (2.0 * math.pi / count)
     return np.column_stack((np.sin(bearing), np.cos(bearing)))
 
 
 @numba.njit(cache=True, nogil=True)
-def expected_gain(states, cell, reach, rays):  # type: ignore[no-untyped-def]
+def expected_gain(states, left, cell, reach, rays):  # type: ignore[no-untyped-def]
     """Return the unknown share of the disc of `reach` planning cells around a flat cell that no obstacle hides.
 
-    What is unknown hides nothing: an upper bound, as for a next best view (Gonzalez-Banos and Latombe 2002).
+    `left` float32 is how much of each cell nobody else is taken to see. What is unknown hides nothing: an upper bound,
+    as for a next best view (Gonzalez-Banos and Latombe 2002).
     """
     rows, columns = states.shape
     row0, column0 = cell // columns + 0.5, cell % columns + 0.5
-    total, unknown = 0.0, 0.0
-    for step in range(1, reach + 1):
-        total += step * rays.shape[0]
+    unknown = 0.0
     for ray in range(rays.shape[0]):
-        d_row, d_column = rays[ray, 0], rays[ray, 1]
         for step in range(1, reach + 1):
-            row, column = int(row0 + step * d_row), int(column0 + step * d_column)
-            if row < 0 or row >= rows or column < 0 or column >= columns or states[row, column] == OCCUPIED:
+            row, column = row0 + step * rays[ray, 0], column0 + step * rays[ray, 1]
+            i, j = int(row), int(column)
+            if row < 0.0 or i >= rows or column < 0.0 or j >= columns or states[i, j] == OCCUPIED:
                 break
-            if states[row, column] == UNKNOWN:
-                unknown += step
-    return unknown / total
+            if states[i, j] == UNKNOWN:
+                unknown += step * left[i, j]
+    return unknown / (rays.shape[0] * reach * (reach + 1) / 2)
 
 
 @numba.njit(cache=True, nogil=True)
-def in_sight(states, first, second):  # type: ignore[no-untyped-def]
-    """Tell whether no obstacle stands between two flat cells."""
-    columns = states.shape[1]
-    row, column = first // columns, first % columns
-    d_row, d_column = second // columns - row, second % columns - column
-    steps = max(abs(d_row), abs(d_column))
-    for k in range(1, steps):
-        if states[row + round(d_row * k / steps), column + round(d_column * k / steps)] == OCCUPIED:
-            return False
-    return True
+def claim(left, states, cell, reach, rays, share):  # type: ignore[no-untyped-def]
+    """Take off `left` what is expected to be seen from a flat cell: `share` of what is near, nothing at `reach`."""
+    rows, columns = states.shape
+    row0, column0 = cell // columns + 0.5, cell % columns + 0.5
+    for ray in range(rays.shape[0]):
+        for step in range(reach):
+            row, column = row0 + step * rays[ray, 0], column0 + step * rays[ray, 1]
+            i, j = int(row), int(column)
+            if row < 0.0 or i >= rows or column < 0.0 or j >= columns or states[i, j] == OCCUPIED:
+                break
+            left[i, j] = min(left[i, j], np.float32(1.0 - share * (1.0 - step / reach)))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,8 +9,9 @@ import numba
 from imagine.core.frontier import PAD, UNKNOWN
 from imagine.core.frontier_paths import FAR, NEAR, OPEN
 
-_STRAIGHT, _NEAR_WEIGHT = 5.0, 3.0  # of costs, as in core.frontier_paths
+_SAMPLE_CELLS = 0.5
 _LOOKAHEAD_CELLS = 30
+_STRAYED_CELLS = 2.0
 _PATIENCE = 4  # points further on that are tried past one that is not clear
 
 
@@ -58,36 +59,35 @@ def _step_back(costs, kinds, cell, columns):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def line_cost(kinds, row0, column0, row1, column1):  # type: ignore[no-untyped-def]
-    """Return the cost of flying straight between two points (in planning cells), -1 where that is not possible.
+def near_on_line(kinds, row0, column0, row1, column1):  # type: ignore[no-untyped-def]
+    """Return how many cells of a straight line between two points (in planning cells) lie beside obstacles.
 
-    In the units of the grid's costs, a metre beside obstacles counting threefold; the first half cell is free.
+    -1 where the line leaves the cells that can be flown in. What lies within a cell of the first point does not count:
+    a drone that is beside a wall must be able to get away from it.
     """
     rows, columns = kinds.shape
     d_row, d_column = row1 - row0, column1 - column0
     length = math.sqrt(d_row * d_row + d_column * d_column)
-    steps = math.ceil(length / 0.5)
-    cost = 0.0
+    steps = math.ceil(length / _SAMPLE_CELLS)
+    near = 0.0
     for k in range(1, steps + 1):
         share = k / steps
         row, column = math.floor(row0 + share * d_row), math.floor(column0 + share * d_column)
-        if not (0 <= row < rows and 0 <= column < columns):
-            return -1.0
-        kind = kinds[row, column]
-        if not kind & OPEN:
-            if share * length > 0.75:
-                return -1.0
+        if share * length <= 1.0:
             continue
-        cost += _NEAR_WEIGHT if kind & NEAR else 1.0
-    return cost * _STRAIGHT * length / max(steps, 1)
+        if not (0 <= row < rows and 0 <= column < columns) or not kinds[row, column] & OPEN:
+            return -1.0
+        if kinds[row, column] & NEAR:
+            near += length / steps
+    return near
 
 
 @numba.njit(cache=True, nogil=True)
 def follow(path, length, begin, kinds, states, row, column):  # type: ignore[no-untyped-def]
-    """Return (d_row, d_column, at, off): which way to fly from (row, column), in planning cells, along a path.
+    """Return (d_row, d_column, at, lost): which way to fly from (row, column), in planning cells, along a path.
 
-    `at` is the point of the path that the drone is nearest to, searched from `begin` on; `off` how many cells it is
-    away from it.
+    `at` is the point of the path that the drone is nearest to, searched from `begin` on; `lost` whether it is off the
+    path and no part of it can be flown to straight.
     """
     columns = kinds.shape[1]
     at, off = begin, 1e9
@@ -96,19 +96,15 @@ def follow(path, length, begin, kinds, states, row, column):  # type: ignore[no-
         square = math.sqrt(d_row * d_row + d_column * d_column)
         if square < off:
             at, off = k, square
-    target, misses = min(at + 1, length - 1), 0
-    along = 0.0
-    before = path[at]
+    target, misses, lost = min(at + 1, length - 1), 0, off > _STRAYED_CELLS
+    near_on_path = 0.0
     for k in range(at + 1, min(length, at + _LOOKAHEAD_CELLS)):
-        cell = path[k]
-        diagonal = cell // columns != before // columns and cell % columns != before % columns
-        step = 7.0 if diagonal else 5.0
-        near = (kinds[cell // columns, cell % columns] | kinds[before // columns, before % columns]) & NEAR
-        along += step * _NEAR_WEIGHT if near else step
-        before = cell
-        straight = line_cost(kinds, row, column, cell // columns + 0.5, cell % columns + 0.5)
-        if 0.0 <= straight <= along + 0.05 * along + 4.0 * off + 1.0:
-            target, misses = k, 0
+        i, j = path[k] // columns, path[k] % columns
+        if kinds[i, j] & NEAR:
+            near_on_path += 1.0
+        near = near_on_line(kinds, row, column, i + 0.5, j + 0.5)
+        if 0.0 <= near <= near_on_path:  # no nearer to obstacles than the path itself
+            target, misses, lost = k, 0, False
         else:
             misses += 1
             if misses > _PATIENCE:
@@ -123,4 +119,4 @@ def follow(path, length, begin, kinds, states, row, column):  # type: ignore[no-
                 if states[k, m] == UNKNOWN:
                     d_row += k - i
                     d_column += m - j
-    return d_row, d_column, at, off
+    return d_row, d_column, at, lost

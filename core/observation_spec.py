@@ -47,7 +47,7 @@ class ObservationSpec(Settings):
     peers_range_m: float = Field(default=10.0, gt=0.0, description="distance to a peer that reads as 1, metres")
     peer_places: int = Field(default=0, ge=0, le=15, description="so many nearest peers are seen where they were heard")
     peer_places_range_m: float = Field(default=10.0, gt=0.0, description="offset to a peer that reads as 1, metres")
-    peer_memory_s: float = Field(default=20.0, gt=0.0, description="reports older than this are forgotten")
+    peer_memory_s: float = Field(default=60.0, gt=0.0, description="reports older than this are forgotten")
     frontiers: int = Field(default=0, ge=0, le=32, description="so many frontiers to choose from are seen, best first")
     visits: Literal["off", "self", "team"] = Field(
         default="off", description="see how long this drone, or it and its peers, have been where"

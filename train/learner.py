@@ -20,9 +20,7 @@ def compute_device(wanted: Literal["auto", "cpu", "cuda"]) -> torch.device:
     """Return where networks are trained; `auto` is CUDA where there is one. Raises InputError where it is missing."""
     found = torch.cuda.is_available()
     if wanted == "cuda" and not found:
-        raise InputError(
-            "run.device: torch finds no cuda; give cpu, or install a torch that is built for it"
-        )
+        raise InputError("run.device: torch finds no cuda; give cpu, or install a torch that is built for it")
     return torch.device("cuda" if found and wanted != "cpu" else "cpu")
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from imagine.core.dealing import LEAST_UTILITY
 from imagine.core.frontier_targets import gain_rays
 from imagine.sim.exploration import Exploration, Observation
 from imagine.train.baselines.parameters import Parameters
@@ -15,6 +16,7 @@ from imagine.train.baselines.plan_state import PlanState, forget, plan_scratch, 
 from imagine.train.baselines.planning import deal_worlds, fly_worlds, survey_worlds
 from imagine.train.pilots import Actions
 
+_UNREACHABLE_M = 1e5
 Dealing = Literal["greedy", "hungarian"]
 
 
@@ -25,7 +27,11 @@ class FrontierPilot:
         """Make a pilot that has yet to begin."""
         self.name = name
         self._parameters, self._dealing = parameters, dealing
-        self._rays = gain_rays(parameters.gain_range_m)
+        self._rays = gain_rays()
+
+    def goals(self) -> NDArray[np.int32]:
+        """Return where each drone is going, int32 `[worlds, drones]`: flat padded planning cells, -1 for nowhere."""
+        return self._state.goal
 
     def begin(self, env: Exploration) -> None:
         """Make room for the worlds of `env`."""
@@ -46,7 +52,7 @@ class FrontierPilot:
             env.ticks, air.rules.ticks_per_s, self._parameters, self._rays, scratch=self._scratch,
         )  # fmt: skip
         if self._dealing == "greedy":
-            over(env.worlds, deal_worlds, state, maps, env.alive, self._parameters)
+            over(env.worlds, deal_worlds, state, maps, self._parameters, self._rays, scratch=self._scratch)
         else:
             deal_by_assignment(state, self._parameters.cost_weight_per_m)
         actions = np.full((env.worlds, env.drones, env.settings.action.size), np.nan, np.float32)
@@ -58,13 +64,16 @@ class FrontierPilot:
 
 
 def deal_by_assignment(state: PlanState, weight: float) -> None:
-    """Deal targets out where a choice is due, so that the sum of weighted ways less utilities is least."""
+    """Deal targets out where a choice is due, so that the sum of worths (log utility less weighted way) is greatest.
+
+    A drone that more robots than targets leave without one takes what is worth most to it.
+    """
     for world, drone in np.argwhere(state.due):
-        count, robots = state.count[world, drone], state.robots[world, drone]
+        found, robots = state.found[world, drone], state.robots[world, drone]
         state.dealt[world, drone] = -1
-        if count:
-            price = weight * state.ways[world, drone, :robots, :count] - state.utility[world, drone, :count]
-            price = np.where(np.isfinite(price), price, 1e6)
-            chosen, dealt = linear_sum_assignment(price)
+        if found:
+            gain = np.log(np.maximum(state.utility[world, drone, :found], LEAST_UTILITY))
+            worth = gain - weight * np.minimum(state.ways[world, drone, :robots, :found], _UNREACHABLE_M)
+            chosen, dealt = linear_sum_assignment(worth, maximize=True)
             mine = dealt[chosen == 0]
-            state.dealt[world, drone] = mine[0] if len(mine) else int(np.argmin(price[0]))
+            state.dealt[world, drone] = mine[0] if len(mine) else int(np.argmax(worth[0]))

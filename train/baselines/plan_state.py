@@ -13,6 +13,9 @@ from imagine.core.frontier_targets import MOST_TARGETS
 PATH_CELLS = 512
 """Cells of a way that are kept: the next hundred metres."""
 BANNED = 8
+"""Frontiers that are left alone at once."""
+DUE = 1 << 20
+"""Age of a choice that has to be made anew."""
 
 
 class PlanState(NamedTuple):
@@ -20,9 +23,9 @@ class PlanState(NamedTuple):
 
     The choice that stands: `goal`, its `path` and `length`, the point `at` of it last passed, its `age` in decisions;
     `due` says that it is to be made anew, and `dealt` which of the `targets` was drawn. What it is made from: `cost`
-    the own ways, `ways` `[..., robots, targets]` metres from the drone itself and `robots` - 1 peers, `utility`.
-    The watchdog: `banned` frontiers `until` which age of the episode's plan `clock`, and where the drone was
-    (`anchor`, metres) when it last got on, `still` decisions ago, while `told` was what it did.
+    the own ways, `found` targets, `ways` `[..., robots, targets]` metres from the drone itself and `robots` - 1 peers,
+    `utility`. The watchdog: `banned` frontiers `until` which decision by `clock`, where the drone was (`anchor`,
+    metres) when it last got on, `still` decisions ago, and `told`, the intent that it was advised.
     """
 
     goal: NDArray[np.int32]
@@ -34,7 +37,7 @@ class PlanState(NamedTuple):
     dealt: NDArray[np.int32]
     cost: NDArray[np.int16]
     targets: NDArray[np.int32]
-    count: NDArray[np.int32]
+    found: NDArray[np.int32]
     ways: NDArray[np.float64]
     robots: NDArray[np.int32]
     utility: NDArray[np.float64]
@@ -53,11 +56,11 @@ def plan_state(worlds: int, drones: int, rows: int, columns: int) -> PlanState:
         goal=np.empty(size, np.int32), path=np.empty((*size, PATH_CELLS), np.int32), length=np.empty(size, np.int32),
         at=np.empty(size, np.int32), age=np.empty(size, np.int32), due=np.empty(size, np.bool_),
         dealt=np.empty(size, np.int32), cost=np.empty((*size, rows, columns), np.int16),
-        targets=np.empty((*size, MOST_TARGETS), np.int32), count=np.empty(size, np.int32),
+        targets=np.empty((*size, MOST_TARGETS), np.int32), found=np.empty(size, np.int32),
         ways=np.empty((*size, drones, MOST_TARGETS)), robots=np.empty(size, np.int32),
         utility=np.empty((*size, MOST_TARGETS)), banned=np.empty((*size, BANNED), np.int32),
         until=np.empty((*size, BANNED), np.int64), clock=np.empty(size, np.int64), anchor=np.empty((*size, 2)),
-        still=np.empty(size, np.int32), told=np.empty((*size, 3)),
+        still=np.empty(size, np.int32), told=np.empty((*size, 2)),
     )  # fmt: skip
     forget(state, np.ones(worlds, np.bool_))
     return state
@@ -67,15 +70,17 @@ def forget(state: PlanState, worlds: NDArray[np.bool_]) -> None:
     """Let the drones of these worlds (bool `[worlds]`) have chosen nothing."""
     for array in state:
         array[worlds] = 0
+    state.age[worlds] = DUE
     state.goal[worlds] = state.dealt[worlds] = -1
     state.banned[worlds] = -1
     state.anchor[worlds] = np.nan
 
 
 class PlanScratch(NamedTuple):
-    """What one thread works with: a cost grid for peers, marks and a queue of cells, and the search's own."""
+    """What one thread works with: ways of a peer, what is left to see, marks and a queue of cells, the search's own."""
 
     cost: NDArray[np.int16]
+    left: NDArray[np.float32]
     marks: NDArray[np.uint8]
     queue: NDArray[np.int32]
     search: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]
@@ -85,6 +90,6 @@ def plan_scratch(rows: int, columns: int) -> PlanScratch:
     """Return scratch for padded planning grids of this size."""
     cells = rows * columns
     return PlanScratch(
-        np.empty((rows, columns), np.int16), np.zeros(cells, np.uint8), np.empty(cells, np.int32),
-        search_scratch(cells),
+        np.empty((rows, columns), np.int16), np.ones((rows, columns), np.float32), np.zeros(cells, np.uint8),
+        np.empty(cells, np.int32), search_scratch(cells),
     )  # fmt: skip

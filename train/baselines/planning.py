@@ -11,21 +11,21 @@ import math
 import numba
 import numpy as np
 
-from imagine.core.action import action_toward_kernel
+from imagine.core.action import action_toward_kernel, intent_kernel
 from imagine.core.dealing import coordinated_target
 from imagine.core.frontier import PAD, PLAN_CELL, UNIT_M
 from imagine.core.frontier_paths import FAR, FRONTIER
 from imagine.core.frontier_targets import distance_m, expected_gain, fill_ways, find_targets, nearest_open
 from imagine.core.frontier_ways import follow, trace_back
+from imagine.train.baselines.plan_state import DUE
 
 _OWN_RINGS, _PEER_RINGS = 4, 12
-_STRAYED_CELLS = 3.0
 _STILL_M, _STILL_DECISIONS, _BANNED_DECISIONS = 0.3, 40, 200
 _GOAL_CELLS = 2
 
 
 @numba.njit(cache=True, nogil=True)
-def _cell_of(x, y, origin, kinds):  # type: ignore[no-untyped-def]
+def _cell_of(x, y, origin):  # type: ignore[no-untyped-def]
     """Return (row, column) of the padded grid for a point in metres, as floats; whole numbers are cells' edges."""
     return y / PLAN_CELL - origin[1] // 2 + PAD, x / PLAN_CELL - origin[0] // 2 + PAD
 
@@ -55,11 +55,12 @@ def _watch(state, world, drone, x, y, followed):  # type: ignore[no-untyped-def]
         if state.until[world, drone, k] <= state.clock[world, drone]:
             state.banned[world, drone, k] = -1
     if state.still[world, drone] >= _STILL_DECISIONS and state.goal[world, drone] >= 0:
-        k = np.argmin(state.until[world, drone])
+        k = int(np.argmin(state.until[world, drone]))
         state.banned[world, drone, k] = state.goal[world, drone]
         state.until[world, drone, k] = state.clock[world, drone] + _BANNED_DECISIONS
         state.still[world, drone] = 0
         state.goal[world, drone] = -1
+        state.age[world, drone] = DUE
 
 
 @numba.njit(cache=True, nogil=True)
@@ -80,11 +81,14 @@ def survey_worlds(  # type: ignore[no-untyped-def]
             state.age[world, drone] += 1
             _watch(state, world, drone, x, y, followed)
             goal, age = state.goal[world, drone], state.age[world, drone]
-            if goal >= 0 and age < parameters.least_ticks:
+            if age < parameters.least_ticks:
                 continue
             if goal >= 0 and age < parameters.replan_ticks and not _is_gone(kinds, goal):
                 continue
             state.due[world, drone] = True
+            state.found[world, drone], state.robots[world, drone] = 0, 1
+            if not maps.frontiers[world, drone]:
+                continue
             _survey(state, maps, world, drone, x, y, peers, ticks[world], ticks_per_s, parameters, rays, scratch)
 
 
@@ -93,28 +97,26 @@ def _survey(state, maps, world, drone, x, y, peers, tick, ticks_per_s, parameter
     kinds, states, origin = maps.kinds[world, drone], maps.states[world, drone], maps.origins[world]
     targets, ways, utility = state.targets[world, drone], state.ways[world, drone], state.utility[world, drone]
     columns = kinds.shape[1]
-    state.count[world, drone], state.robots[world, drone] = 0, 1
-    row, column = _cell_of(x, y, origin, kinds)
+    row, column = _cell_of(x, y, origin)
     start = nearest_open(kinds, math.floor(row), math.floor(column), _OWN_RINGS)
     if start < 0:
         return
     cost = state.cost[world, drone]
     fill_ways(cost, kinds, start, scratch.search)
     radius = round(parameters.cluster_m / PLAN_CELL)
-    count = find_targets(
-        targets, kinds, cost, state.banned[world, drone], radius, scratch.marks, scratch.queue
-    )  # fmt: skip
-    state.count[world, drone] = count
+    count = find_targets(targets, kinds, cost, state.banned[world, drone], radius, scratch.marks, scratch.queue)
+    state.found[world, drone] = count
     if count == 0:
         return
     flat = cost.ravel()
+    scratch.left[:] = np.float32(1.0)
     reach = round(parameters.gain_range_m / PLAN_CELL)
     stays, nearest = -1, parameters.cluster_m
     for k in range(count):
         ways[0, k] = flat[targets[k]] * UNIT_M
         utility[k] = 1.0
         if parameters.gain_exponent > 0.0:
-            utility[k] = expected_gain(states, targets[k], reach, rays) ** parameters.gain_exponent
+            utility[k] = expected_gain(states, scratch.left, targets[k], reach, rays) ** parameters.gain_exponent
         if state.goal[world, drone] >= 0:
             apart = distance_m(targets[k], state.goal[world, drone], columns)
             if apart < nearest:
@@ -126,7 +128,7 @@ def _survey(state, maps, world, drone, x, y, peers, tick, ticks_per_s, parameter
         told = peers[world, drone, peer]
         if peer == drone or told.pose_tick < 0 or (tick - told.heard_tick) / ticks_per_s > parameters.peer_age_s:
             continue
-        row, column = _cell_of(told.x, told.y, origin, kinds)
+        row, column = _cell_of(told.x, told.y, origin)
         start = nearest_open(kinds, math.floor(row), math.floor(column), _PEER_RINGS)
         if start < 0:
             continue
@@ -139,15 +141,19 @@ def _survey(state, maps, world, drone, x, y, peers, tick, ticks_per_s, parameter
 
 
 @numba.njit(cache=True, nogil=True)
-def deal_worlds(first, last, state, maps, alive, parameters):  # type: ignore[no-untyped-def]
+def deal_worlds(first, last, state, maps, parameters, rays, scratch):  # type: ignore[no-untyped-def]
     """Deal targets out by `coordinated_target` where a choice is due."""
-    options = (parameters.cost_weight_per_m, parameters.logarithmic, parameters.discount_range_m)
+    options = (
+        parameters.cost_weight_per_m, parameters.form, parameters.gain_exponent,
+        round(parameters.gain_range_m / PLAN_CELL), parameters.claimed_share,
+    )  # fmt: skip
     for world in range(first, last):
         for drone in range(state.due.shape[1]):
             if state.due[world, drone]:
                 state.dealt[world, drone] = coordinated_target(
                     state.ways[world, drone], state.utility[world, drone], state.targets[world, drone],
-                    maps.states[world, drone], state.robots[world, drone], state.count[world, drone], options,
+                    maps.states[world, drone], state.robots[world, drone], state.found[world, drone], scratch.left,
+                    rays, options,
                 )  # fmt: skip
 
 
@@ -160,7 +166,7 @@ def fly_worlds(first, last, actions, state, maps, poses, alive, action_parameter
                 continue
             kinds, states = maps.kinds[world, drone], maps.states[world, drone]
             x, y, yaw = poses[world, drone, 0], poses[world, drone, 1], poses[world, drone, 2]
-            row, column = _cell_of(x, y, maps.origins[world], kinds)
+            row, column = _cell_of(x, y, maps.origins[world])
             path = state.path[world, drone]
             if state.due[world, drone]:
                 dealt = state.dealt[world, drone]
@@ -172,16 +178,17 @@ def fly_worlds(first, last, actions, state, maps, poses, alive, action_parameter
                     state.length[world, drone] = trace_back(path, state.cost[world, drone], kinds, goal)
             if state.goal[world, drone] < 0 or state.length[world, drone] == 0:
                 continue
-            d_row, d_column, at, off = follow(
+            d_row, d_column, at, lost = follow(
                 path, state.length[world, drone], state.at[world, drone], kinds, states, row, column
             )  # fmt: skip
             state.at[world, drone] = at
-            if off > _STRAYED_CELLS:
-                state.age[world, drone] = 1 << 20  # it is not where the path is: think again next time
+            if lost:
+                state.age[world, drone] = DUE
             length = math.sqrt(d_row * d_row + d_column * d_column)
             if length < 1e-6:
                 length = 1.0
             numbers = action_toward_kernel(d_column / length, d_row / length, action_parameters, yaw, hold_s)
             for k in range(actions.shape[2]):
                 actions[world, drone, k] = numbers[k]
-                state.told[world, drone, k] = numbers[k]
+            intent = intent_kernel(numbers[0], numbers[1], numbers[2], action_parameters, x, y, yaw)
+            state.told[world, drone, 0], state.told[world, drone, 1] = intent[0], intent[1]
