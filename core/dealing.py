@@ -20,19 +20,19 @@ def coordinated_target(ways, utility, targets, states, robots, count, left, rays
     `ways` float64 `[robots, targets]` and `utility` `[targets]` count up to `robots` and `count`.
     """
     dealt = np.full(robots, -1)
-    deal(dealt, ways[:robots, :count], utility[:count], targets[:count], states, left, rays, options)
+    deal(dealt, ways[:robots, :count], utility[:count], targets[:count], states, left, rays, options, rays, 1)
     return dealt[0]
 
 
 @numba.njit(cache=True, nogil=True)
-def deal(dealt, ways, utility, targets, states, left, rays, options):  # type: ignore[no-untyped-def]
+def deal(dealt, ways, utility, targets, states, left, rays, options, gain_rays, stride):  # type: ignore[no-untyped-def]
     """Deal targets out to robots greedily until robot 0 has its own (Burgard et al. 2005): fill `dealt` `[robots]`.
 
     Robot and target of the greatest worth, utility less weighted way, come first; what can be seen from that target is
     then worth less to all others. `dealt` holds -1 where a robot has none yet; `ways` float64 `[robots, targets]`
     metres, inf where there is none; `utility` float64 `[targets]` and `left` (float32, of the grid's shape, see
     `expected_gain`) are overwritten; `options` are (cost weight, form, gain exponent, gain reach in cells, share that
-    is taken off).
+    is taken off). What is taken off is looked for along `rays`, what is left along `gain_rays` by `stride` cells.
     """
     weight, form, exponent, reach, share = options
     robots, count = ways.shape
@@ -55,7 +55,8 @@ def deal(dealt, ways, utility, targets, states, left, rays, options):  # type: i
             claim(left, states, targets[best_target], reach, rays, share)
             for target in range(count):
                 if utility[target] > 0.0:
-                    utility[target] = expected_gain(states, left, targets[target], reach, rays) ** exponent
+                    gain = expected_gain(states, left, targets[target], reach, gain_rays, stride)
+                    utility[target] = gain**exponent
         utility[best_target] = 0.0
 
 

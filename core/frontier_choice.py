@@ -25,7 +25,7 @@ _WAY_M, _OFFSET_M, _MOST = 10.0, 10.0, 3.0
 _CLUSTER_CELLS = 6  # 1.2 m
 _NEAR_CELLS, _FAR_CELLS = 20, 40  # what may be seen: at a target, 4 m around it, and where it leads, 8 m
 _COST_PER_M = 0.1  # of the logarithm of what is seen, as the coordinated planner weighs a way
-_RAYS = 32
+_STRIDE = 2  # cells between two looks for what a target leads to
 _OWN_RINGS, _PEER_RINGS = 4, 12
 _PATH_CELLS = 512
 
@@ -51,7 +51,7 @@ def choice_scratch(rows: int, columns: int) -> ChoiceScratch:
     return ChoiceScratch(
         np.empty((rows, columns), np.int16), np.empty((rows, columns), np.int16), np.zeros(cells, np.uint8),
         np.empty(cells, np.int32), search_scratch(cells), np.empty(MOST_TARGETS, np.int32),
-        np.empty(_PATH_CELLS, np.int32), np.empty((rows, columns), np.float32), gain_rays(_RAYS),
+        np.empty(_PATH_CELLS, np.int32), np.empty((rows, columns), np.float32), gain_rays(),
         np.full(1, -1, np.int32),
     )  # fmt: skip
 
@@ -85,12 +85,12 @@ def fill_frontiers(  # type: ignore[no-untyped-def]
     peers = len(ages)
     ways, fresh = np.empty((peers + 1, count)), np.zeros(peers + 1)
     near, far, utility = np.empty(count), np.empty(count), np.empty(count)
-    left = scratch.left
+    left, few = scratch.left, scratch.rays[::2]
     left[:] = np.float32(1.0)
     for k in range(count):
         ways[0, k] = own[targets[k]] * UNIT_M
-        near[k] = expected_gain(states, left, targets[k], _NEAR_CELLS, scratch.rays)
-        far[k] = utility[k] = expected_gain(states, left, targets[k], _FAR_CELLS, scratch.rays)
+        near[k] = expected_gain(states, left, targets[k], _NEAR_CELLS, few, 1)
+        far[k] = utility[k] = expected_gain(states, left, targets[k], _FAR_CELLS, few, _STRIDE)
     robots = 1
     for peer in range(peers):
         if not ages[peer] < memory_s:
@@ -109,7 +109,7 @@ def fill_frontiers(  # type: ignore[no-untyped-def]
         robots += 1
     dealt = np.full(robots, -1)
     options = (_COST_PER_M, 1, 1.0, _FAR_CELLS, 1.0)
-    deal(dealt, ways[:robots], utility, targets[:count], states, left, scratch.rays, options)
+    deal(dealt, ways[:robots], utility, targets[:count], states, left, scratch.rays, options, few, _STRIDE)
     cos_turn, sin_turn = math.cos(turn), math.sin(turn)
     taken = np.zeros(count, np.bool_)
     for shown in range(min(len(frontiers), count)):
