@@ -26,7 +26,7 @@ from imagine.train.checkpoint import Checkpoint, Phase, check_same_network, load
 from imagine.train.curriculum import Curriculum
 from imagine.train.evaluation import evaluate
 from imagine.train.imitation import collect_labels, label_buffer, learn
-from imagine.train.networks import Actor, Critic
+from imagine.train.networks import Actor, Critic, chosen_device
 from imagine.train.policies import policy_of
 from imagine.train.ppo import Optimisers, update
 from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
@@ -101,8 +101,9 @@ class Learner:
         """Return a fresh learner; the seed decides its weights and draws."""
         torch.manual_seed(settings.run.seed)  # layers initialise from the global generator
         observation, action = settings.env.observation, settings.env.action
-        actor = Actor(settings.network, observation, action.size)
-        critic = Critic(settings.network, observation)
+        device = chosen_device(settings.run.device)
+        actor = Actor(settings.network, observation, action.size).to(device)
+        critic = Critic(settings.network, observation).to(device)
         return Learner(
             actor,
             critic,
@@ -236,6 +237,7 @@ class Trainer:
             numbers=numbers,
             levels=self.episodes.means(),
             drones=self.episodes.drone_means(),
+            paradigm=self.settings.network.paradigm,
             steps_per_s=steps / sum(seconds.values()),
             seconds=seconds,
             wall_s=self._wall_s(),
