@@ -355,6 +355,24 @@ def level_generate(
     generate_levels(seed, area, count, people, crates, out, image, json_file)
 
 
+@bench_app.command("train")
+def bench_train(
+    config: Annotated[Path | None, typer.Argument(help="a training configuration; by default `default`")] = None,
+    worlds: Annotated[int | None, typer.Option(help="how many; by default 64")] = None,
+    drones: Annotated[int | None, typer.Option(help="in each world; by default 3")] = None,
+    rounds: Annotated[int | None, typer.Option(help="rollouts and updates to take medians of; by default 5")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="small and rough, in seconds")] = False,
+    overrides: Overrides = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure how fast training goes: rollout and update, and where the time goes."""
+    _needs("torch", "train")
+    check_outputs(json_file)
+    from imagine.bench_train_command import bench_train_and_show
+
+    bench_train_and_show(config, worlds, drones, rounds, quick, tuple(overrides or ()), json_file)
+
+
 @bench_app.command("twin")
 def bench_twin(
     level: Annotated[str, typer.Option(help="a level, 0 to 6, or a YAML file")] = "6",

@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 
-from imagine.core.errors import InputError
 from imagine.train.checkpoint import Checkpoint, load_weights
-from imagine.train.networks import Actor, Critic, steers
+from imagine.train.networks import Actor, Critic, chosen_device, steers
 from imagine.train.ppo import Optimisers
 from imagine.train.settings import TrainSettings
-
-
-def compute_device(wanted: Literal["auto", "cpu", "cuda"]) -> torch.device:
-    """Return where networks are trained; `auto` is CUDA where there is one. Raises InputError where it is missing."""
-    found = torch.cuda.is_available()
-    if wanted == "cuda" and not found:
-        raise InputError("run.device: torch finds no cuda; give cpu, or install a torch that is built for it")
-    return torch.device("cuda" if found and wanted != "cpu" else "cpu")
 
 
 @dataclass
@@ -40,7 +31,7 @@ class Learner:
         """Return a fresh learner; the seed decides its weights and draws."""
         torch.manual_seed(settings.run.seed)  # layers initialise from the global generator
         observation, action = settings.env.observation, settings.env.action
-        device = compute_device(settings.run.device)
+        device = chosen_device(settings.run.device)
         actor = Actor(settings.network, observation, action.size, steers(observation, action)).to(device)
         critic = Critic(settings.network, observation).to(device)
         return Learner(

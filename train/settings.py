@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 from pydantic import Field
 
@@ -11,7 +10,7 @@ from imagine.core.config import Settings, load_settings
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.curriculum_settings import CurriculumSettings
 from imagine.train.imitation import ImitationSettings
-from imagine.train.networks import NetworkSettings
+from imagine.train.networks import DeviceName, NetworkSettings
 from imagine.train.ppo_settings import PpoSettings
 from imagine.train.tracking.settings import TrackingSettings
 
@@ -25,8 +24,8 @@ class RunSettings(Settings):
     name: str = Field(default="default", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)
     root: str = Field(default="runs", description="folder of run folders")
     seed: int = Field(default=0, ge=0)
+    device: DeviceName = Field(default="auto", description="of networks and rollouts; auto: CUDA where there is one")
     threads: int | None = Field(default=None, ge=1, description="of torch; none: one for each core")
-    device: Literal["auto", "cpu", "cuda"] = Field(default="auto", description="of the networks; auto: cuda if found")
     checkpoint_every_s: float = Field(default=60.0, gt=0.0)
     keep_checkpoints: int = Field(default=3, ge=1, description="numbered checkpoints kept beside the latest")
     final_episodes: int = Field(default=8, ge=0, description="evaluated on each level at the end; 0: none")

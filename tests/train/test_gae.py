@@ -40,3 +40,24 @@ def test_nothing_after_an_episodes_end_counts():
     dones = torch.tensor([[True], [False]])
     advantages, _ = advantages_and_returns(rewards, values, dones, torch.tensor([50.0]), 0.99, 0.95)
     assert advantages[0].item() == pytest.approx(1.0)
+
+
+def test_what_the_clock_ends_goes_on_being_worth_something():
+    """At a limit the value of the last state stands for all that would still have come; at a death nothing does."""
+    rewards, values = torch.tensor([[1.0, 1.0], [1.0, 1.0]]), torch.full((2, 2), 10.0)
+    dones = torch.tensor([[True, True], [False, False]])
+    truncated = torch.tensor([[True, False], [False, False]])
+    last = torch.tensor([10.0, 10.0])
+    advantages, returns = advantages_and_returns(rewards, values, dones, last, 0.9, 0.95, truncated)
+    assert advantages[0].tolist() == pytest.approx([1.0 + 0.9 * 10.0 - 10.0, 1.0 - 10.0])
+    assert returns[0].tolist() == pytest.approx([10.0, 1.0])
+    assert advantages[1].tolist() == pytest.approx([0.0, 0.0])
+
+
+def test_a_limit_that_is_far_enough_changes_nothing():
+    """Rewards of 1 for ever are worth 1 / (1 - gamma), whether rollouts are cut by clocks or not."""
+    gamma, worth = 0.9, 1.0 / (1.0 - 0.9)
+    rewards, values = torch.ones((6, 1)), torch.full((6, 1), worth)
+    dones = torch.tensor([[False], [False], [True], [False], [False], [True]])
+    advantages, _ = advantages_and_returns(rewards, values, dones, torch.tensor([worth]), gamma, 0.95, dones)
+    torch.testing.assert_close(advantages, torch.zeros((6, 1)), atol=1e-5, rtol=0)

@@ -8,13 +8,13 @@ from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.imitation import ImitationSettings, collect_labels, imitation_loss, learn
 from imagine.train.labels import LabelBuffer
-from imagine.train.networks import Actor, Critic, NetworkSettings, log_probability
+from imagine.train.networks import Actor, Critic, NetworkSettings, at_precision, compute_dtype, log_probability
 from imagine.train.ppo import Optimisers, PpoSettings, update
 from imagine.train.rollout import Rollout, collect
 
 SPEC = ObservationSpec(view_cells=16, lidar_sectors=16)
 SMALL = NetworkSettings(view_channels=(8, 8, 8), critic_channels=(8, 8), lidar_channels=4, hidden=32)
-PPO = PpoSettings(minibatch=64, actor_lr=1e-3, critic_lr=1e-3)
+PPO = PpoSettings(minibatch=64, actor_lr=1e-3, critic_lr=1e-3, precision="float32")
 
 
 def learners(seed=0):
@@ -79,14 +79,120 @@ def test_a_large_divergence_ends_the_policys_steps():
     assert torch.equal(actor.mean.weight, weights)
 
 
-def test_a_loss_that_is_no_number_never_reaches_the_weights():
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda rollout: rollout.rewards.__setitem__((3, 3), float("nan")), "in update 7: the rewards are not finite"),
+        (lambda rollout: rollout.observations["level"].fill_(float("inf")), "the critic's values are not finite"),
+        (lambda rollout: rollout.log_probs.fill_(float("nan")), r"the policy loss is nan, .*actor.*ppo\.actor_lr"),
+    ],
+    ids=["rewards", "values", "policy"],
+)
+def test_a_loss_that_is_no_number_never_reaches_the_weights(spoil, message):
     actor, critic, optimisers, generator = learners()
     rollout = rollout_that_pays_for_going_east(actor, generator)
-    rollout.rewards[3, 3] = float("nan")
-    weights = {name: value.clone() for name, value in critic.state_dict().items()}
-    with pytest.raises(WorkError, match="diverged"):
-        update(actor, critic, optimisers, rollout, PPO, generator)
-    assert all(torch.equal(value, weights[name]) for name, value in critic.state_dict().items())
+    spoil(rollout)
+    networks = (actor,) if "policy" in message else (actor, critic)
+    before = [{name: value.clone() for name, value in network.state_dict().items()} for network in networks]
+    with pytest.raises(WorkError, match=f"training diverged.*{message}"):
+        update(actor, critic, optimisers, rollout, PPO, generator, number=7)
+    for network, weights in zip(networks, before, strict=True):
+        assert all(torch.equal(value, weights[name]) for name, value in network.state_dict().items())
+    assert all(value.isfinite().all() for value in critic.state_dict().values())
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_values_are_learned_at_any_scale_of_rewards(scale):
+    """Normalised returns: how fast the critic learns does not depend on the size of rewards."""
+    actor, critic, optimisers, generator = learners()
+    rollout = rollout_that_pays_for_going_east(actor, generator, steps=4)
+    signal = (rollout.observations["motion"][..., 0] > 0.5).float()
+    rollout.observations["lidar"][:] = signal[..., None]
+    rollout.rewards = scale * (5.0 + signal)
+    for _ in range(14):
+        numbers = update(actor, critic, optimisers, rollout, PPO, generator, policy_moves=False)
+    assert numbers["explained_variance"] > 0.7
+    assert numbers["value"] == pytest.approx(numbers["return"], rel=0.1)
+    assert numbers["return_std"] == pytest.approx(scale * 0.5, rel=0.1)
+
+
+def test_a_new_scale_of_returns_leaves_the_values_as_they_are():
+    _, critic, _, generator = learners()
+    seen = {key: torch.rand((6, *shape), generator=generator) for key, shape in SPEC.shapes.items()}
+    seen["level"] = torch.rand((6, 5, 32, 32), generator=generator)
+    critic.rescale(torch.randn(500, generator=generator))
+    with torch.no_grad():
+        before = critic.scale.returns(critic(seen))
+        for offset in (3.0, -40.0):
+            critic.rescale(offset + 7.0 * torch.randn(500, generator=generator))
+            torch.testing.assert_close(critic.scale.returns(critic(seen)), before, rtol=1e-4, atol=1e-4)
+    assert critic.scale.std.item() > 7.0
+    returns = torch.randn(9)
+    torch.testing.assert_close(critic.scale.returns(critic.scale.normalised(returns)), returns, rtol=1e-4, atol=1e-4)
+
+
+def test_without_normalisation_the_critic_learns_returns_themselves():
+    actor, critic, optimisers, generator = learners()
+    settings = PPO.model_copy(update={"value_normalisation": False})
+    rollout = rollout_that_pays_for_going_east(actor, generator)
+    update(actor, critic, optimisers, rollout, settings, generator)
+    assert (critic.scale.mean.item(), critic.scale.std.item()) == (0.0, 1.0)
+
+
+def test_schedules_follow_the_run():
+    actor, critic, optimisers, generator = learners()
+    rollout = rollout_that_pays_for_going_east(actor, generator)
+    settings = PpoSettings(
+        minibatch=128, actor_lr={"start": 1e-3, "end": 1e-4}, critic_lr={"start": 1e-3, "end": 1e-5, "shape": "cosine"},
+        entropy_weight={"start": 0.02, "end": 0.0, "until": 0.5}, action_std={"start": 0.4, "end": 0.1},
+    )  # fmt: skip
+    numbers = update(actor, critic, optimisers, rollout, settings, generator, progress=0.5)
+    assert numbers["actor_lr"] == pytest.approx(5.5e-4)
+    assert numbers["critic_lr"] == pytest.approx(5.05e-4)
+    assert numbers["entropy_weight"] == 0.0
+    assert numbers["action_std_0"] == numbers["action_std_1"] == pytest.approx(0.25)
+    assert actor.spread().exp().tolist() == pytest.approx([0.25, 0.25])
+    assert {"actor_gradient", "critic_gradient", "explained_variance", "action_abs", "entropy"} <= numbers.keys()
+
+
+def test_a_clipped_value_loss_moves_values_less():
+    moved = []
+    for clip in (None, 0.01):
+        actor, critic, optimisers, generator = learners()
+        rollout = rollout_that_pays_for_going_east(actor, generator)
+        settings = PPO.model_copy(update={"value_clip": clip, "epochs": 4})
+        before = critic.scale.returns(critic(rollout.last)).detach()
+        update(actor, critic, optimisers, rollout, settings, generator, policy_moves=False)
+        moved.append((critic.scale.returns(critic(rollout.last)).detach() - before).abs().mean().item())
+    assert moved[1] < 0.7 * moved[0]
+
+
+def test_bfloat16_computes_about_the_same_and_leaves_weights_and_flight_in_float32():
+    actor, critic, _, generator = learners()
+    torch.nn.init.normal_(actor.mean.weight)
+    seen = {key: torch.rand((6, *shape), generator=generator) for key, shape in SPEC.shapes.items()}
+    seen["level"] = torch.rand((6, 5, 32, 32), generator=generator)
+    exact, exact_values = actor.decide(seen).mean, critic(seen)
+    with at_precision("bfloat16", actor, critic):
+        rough, values = actor.decide(seen).mean, critic(seen)
+    assert rough.dtype == values.dtype == torch.float32
+    assert not torch.equal(rough, exact)
+    torch.testing.assert_close(rough, exact, atol=0.05, rtol=0)
+    torch.testing.assert_close(values, exact_values, atol=0.05, rtol=0.05)
+    assert torch.equal(actor.decide(seen).mean, exact)
+    assert {weight.dtype for weight in actor.parameters()} == {torch.float32}
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_on_cuda_rollouts_and_updates_stay_there():
+    assert compute_dtype("auto", torch.device("cuda")) == torch.bfloat16
+    env = Exploration(ExplorationSettings(levels=("0",), worlds=2, drones=2, observation=SPEC), seed=1)
+    actor, critic, _, generator = learners()
+    actor, critic = actor.to("cuda"), critic.to("cuda")
+    rollout, _ = collect(env, env.reset(), actor, 8, generator, "auto")
+    assert {rollout.observations["views"].device.type, rollout.rewards.device.type} == {"cuda"}
+    numbers = update(actor, critic, Optimisers(actor, critic), rollout, PPO, generator)
+    assert np.isfinite(list(numbers.values())).all()
 
 
 def test_imitation_comes_close_to_the_planner():

@@ -13,13 +13,21 @@ worth.
 """
 
 from imagine.train.networks.actor import Actor, Decisions, steers
-from imagine.train.networks.computing import Computing, Precision, at_precision, compute_dtype
+from imagine.train.networks.computing import (
+    Computing,
+    DeviceName,
+    Precision,
+    at_precision,
+    chosen_device,
+    compute_dtype,
+)
 from imagine.train.networks.critic import Critic
 from imagine.train.networks.encoders import LEVEL_CELLS, LEVEL_CHANNELS
 from imagine.train.networks.gaussian import LOG_STD_RANGE, entropy, log_probability
 from imagine.train.networks.settings import NetworkSettings
 
 __all__ = [
-    "LEVEL_CELLS", "LEVEL_CHANNELS", "LOG_STD_RANGE", "Actor", "Computing", "Critic", "Decisions", "NetworkSettings",
-    "Precision", "at_precision", "compute_dtype", "entropy", "log_probability", "steers",
+    "LEVEL_CELLS", "LEVEL_CHANNELS", "LOG_STD_RANGE", "Actor", "Computing", "Critic", "Decisions", "DeviceName",
+    "NetworkSettings", "Precision", "at_precision", "chosen_device", "compute_dtype", "entropy", "log_probability",
+    "steers",
 ]  # fmt: skip

@@ -12,7 +12,17 @@ from typing import Literal
 import torch
 from torch import nn
 
+from imagine.core.errors import InputError
+
 Precision = Literal["auto", "float32", "bfloat16"]
+DeviceName = Literal["auto", "cpu", "cuda"]
+
+
+def chosen_device(name: DeviceName) -> torch.device:
+    """Return the device that a setting names; `auto` is CUDA where there is one. Raises InputError where it is not."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("run.device: cuda: torch finds no CUDA device here; say auto or cpu")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:

@@ -40,7 +40,7 @@ class Critic(Computing):
         features = settings.memory_size if settings.memory == "gru" else hidden
         width = features + (hidden if self.level is not None else 0)
         self.trunk = nn.Sequential(orthogonal(nn.Linear(width, hidden)), nn.ReLU()) if self.is_shared else None
-        self.value = orthogonal(nn.Linear(hidden, 1), gain=1.0)
+        self.value = orthogonal(nn.Linear(hidden, 1), gain=0.1)  # begin near the mean
         self.scale = ReturnScale()
 
     def forward(self, seen: Seen, drones: int = 1, features: Tensor | None = None) -> Tensor:

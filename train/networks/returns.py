@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 RETURN_MEMORY = 0.05  # weight of the newest rollout's returns: 20 rollouts are remembered
-MIN_RETURN_STD = 1e-3  # where no reward was seen yet, noise must not be blown up to be the signal
+MIN_RETURN_STD = 1e-4  # where no reward was seen yet, noise must not be blown up to be the signal
 
 
 class ReturnScale(nn.Module):
@@ -38,14 +38,19 @@ class ReturnScale(nn.Module):
 
     @torch.no_grad()
     def take(self, returns: Tensor, head: nn.Linear) -> None:
-        """Take new returns into the statistics, and change the head so that what it stands for stays the same."""
+        """Take new returns into the statistics, and change the head so that what it stands for stays the same.
+
+        Not so the first time: an untrained head stands for nothing that is worth to be kept.
+        """
+        is_first = bool(self.weight == 0.0)
         new = torch.stack([returns.double().mean(), returns.double().square().mean()])
         self.moments.lerp_(new, RETURN_MEMORY)
         self.weight.lerp_(torch.ones_like(self.weight), RETURN_MEMORY)
         mean, square = self.moments / self.weight
         std = (square - mean.square()).clamp(min=MIN_RETURN_STD**2).sqrt().float()
         mean = mean.float()
-        head.weight.mul_(self.std / std)
-        head.bias.mul_(self.std).add_(self.mean - mean).div_(std)
+        if not is_first:
+            head.weight.mul_(self.std / std)
+            head.bias.mul_(self.std).add_(self.mean - mean).div_(std)
         self.mean.copy_(mean)
         self.std.copy_(std)
