@@ -14,9 +14,11 @@ import torch
 
 from imagine.core.contract import LEVEL
 from imagine.sim.exploration import Exploration
-from imagine.train.networks import Actor, Critic, at_precision, chosen_device, compute_dtype
-from imagine.train.ppo import Optimisers, update
-from imagine.train.rollout import Recall, Rollout, collect, image_dtype, next_means, stored
+from imagine.train.curriculum import Curriculum
+from imagine.train.learner import Learner
+from imagine.train.networks import at_precision, compute_dtype
+from imagine.train.ppo import update
+from imagine.train.rollout import Recall, Rollout, collect, image_dtype, next_decisions, stored
 from imagine.train.settings import TrainSettings
 from imagine.train.values import values_of
 
@@ -47,20 +49,18 @@ class TrainingBench:
         """Get ready. Raises InputError where a level or the device is wrong."""
         self.settings = settings
         torch.set_num_threads(settings.run.threads or len(os.sched_getaffinity(0)))
-        torch.manual_seed(settings.run.seed)
-        device = chosen_device(settings.run.device)
-        self.env = Exploration(settings.env, settings.run.seed)
+        learner = Learner.create(settings)
+        self.actor, self.critic = learner.actor, learner.critic
+        self.optimisers, self.generator = learner.ppo, learner.generator
+        self.env = Exploration(Curriculum(settings.curriculum, settings.env).environment, settings.run.seed)
         self.observation = self.env.reset()
-        self.actor = Actor(settings.network, settings.env.observation, settings.env.action.size).to(device)
-        self.critic = Critic(settings.network, settings.env.observation).to(device)
-        self.optimisers = Optimisers(self.actor, self.critic)
-        self.generator = torch.Generator().manual_seed(settings.run.seed)
         self.recall = Recall.nothing(self.actor, self.env.worlds * self.env.drones)
 
     def run(self, rounds: int, progress: Callable[[str], None]) -> Results:
         """Fly and learn `rounds` times after a short warm-up; return medians over the rounds.
 
-        `training` is the rate of rollout and update together; the other rows are microseconds an agent-step: `rollout`
+        `training` is the rate of rollout and update together, an agent-step being a decision, which may stand for
+        several ticks of a drone; the other rows are microseconds an agent-step: `rollout`
         and its parts `env`, `acting` and `level_images` (which a critic or a centralised actor sees), `update` and its
         part `values`. Parts are measured apart from the whole, after it.
         """
@@ -99,7 +99,7 @@ class TrainingBench:
             seen = [{key: value[t] for key, value in rollout.observations.items()} for t in range(steps)]
             with watches["acting"].running():
                 for t in range(steps):
-                    next_means(self.actor, {**seen[t], "alive": rollout.alive[t]}, recall, self.env.drones)
+                    next_decisions(self.actor, {**seen[t], "alive": rollout.alive[t]}, recall, self.env.drones)
             with watches["level_images"].running():
                 if LEVEL in seen[0]:
                     for _ in range(steps):
@@ -115,6 +115,7 @@ class TrainingBench:
             "training": {
                 "value": statistics.median(rates), "unit": "agent-steps/s", "low": min(rates), "high": max(rates),
                 "per_cpu_s": statistics.median(per_round / s for s in watches["training"].cpu_s),
+                "drone_ticks_per_s": statistics.median(rates) * self.settings.env.action.decision_ticks,
                 "rounds": len(rates), "worlds": self.env.worlds, "drones": self.env.drones,
                 "precision": str(compute_dtype(self.settings.ppo.precision, self.actor.device)).removeprefix("torch."),
                 "device": self.actor.device.type, "threads": torch.get_num_threads(),

@@ -16,7 +16,7 @@ import torch
 
 from imagine.core.errors import InputError, WorkError
 from imagine.sim.exploration import Exploration
-from imagine.sim.level_names import PREFIX
+from imagine.sim.generator import PREFIX
 from imagine.train.atomic_file import write_atomically
 from imagine.train.baselines import baseline
 from imagine.train.checkpoint import Checkpoint, Phase, check_same_network, load_checkpoint
