@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -40,6 +41,11 @@ class LevelVariants:
     def __len__(self) -> int:
         """Return the number of levels."""
         return len(self._levels)
+
+    @functools.cached_property
+    def fingerprints(self) -> dict[str, str]:
+        """The levels' geometry by name, see `Level.fingerprint`."""
+        return {name: level.fingerprint() for name, level in zip(self.names, self._levels, strict=True)}
 
     def draw(self, generator: np.random.Generator, weights: NDArray[np.float64]) -> tuple[int, int]:
         """Draw a level by `weights` `[levels]`, which add up to 1, and one of its variants; return their numbers."""

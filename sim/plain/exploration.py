@@ -126,7 +126,11 @@ class PlainExploration:
         hand_over_maps(batch, world, self.maps)
         self.alive[...] = batch.alive[world]
         self.ranges[...] = batch.ranges[world]
-        self.ticks, self._idle, self._limit = int(batch.ticks[world]), int(batch._idle[world]), int(batch._limit[world])
+        self.ticks, self._idle, self._limit = (
+            int(batch.ticks[world]),
+            int(batch._episodes.idle[world]),
+            int(batch._episodes.limit[world]),
+        )
 
     def step(self, actions: NDArray[np.float32]) -> PlainStep:
         """Fly one decision (`ActionSpec.decision_ticks` ticks) with actions `[drones, action size]` in [-1, 1]."""
