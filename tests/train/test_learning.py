@@ -6,6 +6,7 @@ from imagine.core.errors import WorkError
 from imagine.core.observation_spec import ObservationSpec
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
+from imagine.train.baselines import baseline
 from imagine.train.imitation import ImitationSettings, collect_labels, imitation_loss, learn
 from imagine.train.labels import LabelBuffer
 from imagine.train.networks import Actor, Critic, NetworkSettings, at_precision, compute_dtype, log_probability
@@ -201,7 +202,9 @@ def test_imitation_comes_close_to_the_planner():
     buffer = LabelBuffer(2000)
     settings = ImitationSettings(gradient_steps=60, minibatch=128, lr=2e-3)
     rng = np.random.default_rng(0)
-    _, _, added = collect_labels(env, env.reset(), actor, buffer, 60, 0.5, rng, generator)
+    seen, teacher = env.reset(), baseline("frontier", 0)
+    teacher.begin(env)
+    _, _, added = collect_labels(env, seen, actor, teacher, buffer, 60, 0.5, rng, generator)
     assert added == len(buffer) > 300
     batch = buffer.sample(256, generator)
     before = imitation_loss(batch.decide(actor).mean, batch["labels"], 0.25).item()

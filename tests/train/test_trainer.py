@@ -62,6 +62,12 @@ def test_equal_seeds_give_equal_runs_and_other_seeds_others(finished, tmp_path):
     assert not torch.equal(first.actor["mean.weight"], other.actor["mean.weight"])
 
 
+def curve(folder):
+    """Return a run's metrics, but for times and memory."""
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in row.items() if k.split("/")[0] not in ("time", "speed", "memory")} for row in rows]
+
+
 def test_sigterm_saves_and_the_resumed_run_goes_on_from_there(tmp_path):
     def terminate(report):
         if report.phase == "ppo" and report.phase_steps >= 256:
@@ -81,9 +87,23 @@ def test_sigterm_saves_and_the_resumed_run_goes_on_from_there(tmp_path):
     rows = [json.loads(line)["agent_steps"] for line in (resumed.folder / "metrics.jsonl").read_text().splitlines()]
     assert rows == [128 * (i + 1) for i in range(6)]
     train(None, resume=copy)
-    one, two = load_checkpoint(resumed.folder), load_checkpoint(copy)
-    assert all(torch.equal(value, two.actor[name]) for name, value in one.actor.items())
-    assert all(torch.equal(value, two.critic[name]) for name, value in one.critic.items())
+    straight = train(Path("smoke"), overrides(tmp_path, "run.name=straight"))
+    for other in (copy, straight.folder):
+        assert curve(other) == curve(resumed.folder)
+        one, two = load_checkpoint(resumed.folder), load_checkpoint(other)
+        assert all(torch.equal(value, two.actor[name]) for name, value in one.actor.items())
+        assert all(torch.equal(value, two.critic[name]) for name, value in one.critic.items())
+
+
+def test_a_run_stopped_while_it_imitates_begins_anew_and_comes_to_the_same(tmp_path, finished):
+    def terminate(report):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    stopped = train(Path("smoke"), overrides(tmp_path), report=terminate)
+    assert not stopped.finished
+    assert not stopped.checkpoint.exists()
+    resumed = train(None, resume=stopped.folder)
+    assert curve(resumed.folder) == curve(finished[0].folder)
 
 
 def test_a_restored_learner_learns_exactly_as_the_one_that_was_saved(finished):
@@ -122,7 +142,7 @@ def test_resume_takes_no_second_configuration(finished):
 def test_another_network_is_named(finished, tmp_path):
     copy = tmp_path / "run"
     shutil.copytree(finished[0].folder, copy)
-    with pytest.raises(InputError, match=r"made for another network: '.*' is \(.*\), this one needs"):
+    with pytest.raises(InputError, match=r"made for another network: network.hidden is 128 in it, 64 here"):
         train(None, ("network.hidden=64",), resume=copy)
 
 
