@@ -407,11 +407,13 @@ class Exploration:
 
     def _identity(self) -> dict[str, Any]:
         """Return all that decides how worlds go on from a state."""
+        settings = self.settings.model_dump(mode="json")
+        del settings["level_weights"]  # those that count now are part of the state
         return {
             "seed": self.seed,
             "world_keys": list(self.twin.world_keys),
             "restart": self._restarts,
-            **self.settings.model_dump(mode="json"),
+            **settings,
             "fingerprints": self._episodes.variants.fingerprints,
         }
 

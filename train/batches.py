@@ -87,12 +87,11 @@ class Cut:
         """Units with rows that count."""
         return len(self.units)
 
-    def shuffled(self, rows: int, generator: torch.Generator) -> Iterator[Batch]:
-        """Go through all units once in a random order, in batches of about `rows` rows and of almost equal size."""
+    def shuffled(self, rows: int, generator: torch.Generator) -> list[Tensor]:
+        """Return all units once, in a random order, cut into batches of about `rows` rows and of almost equal size."""
         order = self.units[torch.randperm(len(self.units), generator=generator).to(self.units.device)]
         pieces = max(1, round(len(order) * self.length * self.drones / rows))
-        for units in torch.tensor_split(order, min(pieces, len(order))):
-            yield self.batch(units)
+        return list(torch.tensor_split(order, min(pieces, len(order))))
 
     def in_order(self, rows: int) -> Iterator[tuple[Tensor, Batch]]:
         """Go through all units in batches of about `rows` rows, each with the indices of its rows."""

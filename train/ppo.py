@@ -1,6 +1,7 @@
 """Proximal policy optimisation (Schulman et al. 2017): the whole update, on one page.
 
-Actor and critic have optimisers of their own. Their losses are summed only where they share an encoder.
+Actor and critic have optimisers of their own and learn side by side, each on half of the threads. Only where they share
+an encoder are their losses summed.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from imagine.train.gae import advantages_and_returns
 from imagine.train.networks import LOG_STD_RANGE, Actor, Critic, Decisions, at_precision
 from imagine.train.ppo_settings import PpoSettings
 from imagine.train.rollout import Rollout, mean_of
+from imagine.train.side_by_side import side_by_side
 from imagine.train.values import values_of
 
 __all__ = ["Optimisers", "PpoSettings", "update"]
@@ -82,18 +84,25 @@ class _Update:
         samples |= {"actions": rollout.actions.flatten(0, 1), "log_probs": rollout.log_probs.flatten(), **judged}
         drones = rollout.drones if self.actor.is_central else 1
         cut = Cut(samples, rollout.alive, drones, rollout.sequence_steps, rollout.states, rollout.starts)
-        step = self._step_together if self.critic.is_shared else self._step_apart
-        records: list[Record] = []
-        policy_steps = 0
-        for _ in range(settings.epochs):
-            for batch in cut.shuffled(settings.minibatch, generator):
-                record, policy_moves = step(batch, policy_moves)
-                policy_steps += "policy_loss" in record
-                records.append(record)
+        pieces = [units for _ in range(settings.epochs) for units in cut.shuffled(settings.minibatch, generator)]
+        if self.critic.is_shared:
+            records = self._learn_together(cut, pieces, policy_moves)
+        elif policy_moves:
+            of_actor, of_critic = side_by_side(
+                lambda: self._teach_actor(cut, pieces), lambda: self._teach_critic(cut, pieces)
+            )
+            records = of_actor + of_critic
+        else:
+            records = self._teach_critic(cut, pieces)
         if settings.action_std is not None:  # of the next rollout: within this one all ratios are of one spread
             with torch.no_grad():
                 self.actor.log_std.fill_(math.log(settings.action_std.at(self.progress))).clamp_(*LOG_STD_RANGE)
-        return {**mean_of(records), **numbers, **self._spread_numbers(), "policy_steps": float(policy_steps)}
+        return {
+            **mean_of(records),
+            **numbers,
+            **self._spread_numbers(),
+            "policy_steps": float(sum("policy_loss" in record for record in records)),
+        }
 
     def _judge(self, rollout: Rollout) -> tuple[dict[str, Tensor], Record]:
         """Return advantages, value targets and values, flat and normalised, of all samples; and what they are like."""
@@ -125,38 +134,49 @@ class _Update:
             "action_abs": float(rollout.actions.flatten(0, 1)[lived].abs().mean()),
         }
 
-    def _step_apart(self, batch: Batch, policy_moves: bool) -> tuple[Record, bool]:
-        """Improve the critic, and the actor unless it rests or has gone far enough; tell whether it may go on."""
-        loss = self._value_loss(batch, batch.of_counted(self.critic(batch.samples, batch.drones)))
-        norm = self._descend(loss, {"value": loss}, (self.critic,), "critic")
-        record = {"value_loss": loss.item(), "critic_gradient": norm}
-        if not policy_moves:
-            return record, False
-        loss, found, policy_moves = self._policy_loss(batch, batch.decide(self.actor))
-        record |= found
-        if policy_moves:
+    def _teach_critic(self, cut: Cut, pieces: list[Tensor]) -> list[Record]:
+        """Take a step with each piece."""
+        records = []
+        for units in pieces:
+            batch = cut.batch(units)
+            loss = self._value_loss(batch, batch.of_counted(self.critic(batch.samples, batch.drones)))
+            norm = self._descend(loss, {"value": loss}, (self.critic,), "critic")
+            records.append({"value_loss": loss.item(), "critic_gradient": norm})
+        return records
+
+    def _teach_actor(self, cut: Cut, pieces: list[Tensor]) -> list[Record]:
+        """Take a step with each piece, until the policy has gone far enough."""
+        records = []
+        for units in pieces:
+            batch = cut.batch(units)
+            loss, record, is_near = self._policy_loss(batch, batch.decide(self.actor))
+            records.append(record)
+            if not is_near:
+                break
             norm = self._descend(loss, {"policy": loss}, (self.actor,), "actor")
             record |= {"policy_loss": loss.item(), "actor_gradient": norm}
-        return record, policy_moves
+        return records
 
-    def _step_together(self, batch: Batch, policy_moves: bool) -> tuple[Record, bool]:
-        """Improve both by the sum of their losses. While the policy rests, the encoder does too."""
-        decisions = batch.decide(self.actor)
-        record: Record = {}
-        policy_loss = None
-        if policy_moves:
-            policy_loss, record, policy_moves = self._policy_loss(batch, decisions)
-        features = decisions.features if policy_moves else decisions.features.detach()
-        values = batch.of_counted(self.critic(batch.samples, batch.drones, features))
-        value_loss = self._value_loss(batch, values)
-        record["value_loss"] = value_loss.item()
-        if policy_loss is None or not policy_moves:
-            record["critic_gradient"] = self._descend(value_loss, {"value": value_loss}, (self.critic,), "critic")
-            return record, False
-        both = {"policy": policy_loss, "value": value_loss}
-        total = policy_loss + self.settings.value_weight * value_loss
-        norm = self._descend(total, both, (self.actor, self.critic), "actor")
-        return {**record, "policy_loss": policy_loss.item(), "actor_gradient": norm, "critic_gradient": norm}, True
+    def _learn_together(self, cut: Cut, pieces: list[Tensor], policy_moves: bool) -> list[Record]:
+        """Improve both by the sum of their losses. While the policy rests, the encoder that they share does too."""
+        records = []
+        for units in pieces:
+            batch = cut.batch(units)
+            decisions = batch.decide(self.actor)
+            policy_loss, record, is_near = self._policy_loss(batch, decisions)
+            policy_moves = policy_moves and is_near
+            features = decisions.features if policy_moves else decisions.features.detach()
+            value_loss = self._value_loss(batch, batch.of_counted(self.critic(batch.samples, batch.drones, features)))
+            record["value_loss"] = value_loss.item()
+            if policy_moves:
+                both = {"policy": policy_loss, "value": value_loss}
+                total = policy_loss + self.settings.value_weight * value_loss
+                norm = self._descend(total, both, (self.actor, self.critic), "actor")
+                record |= {"policy_loss": policy_loss.item(), "actor_gradient": norm, "critic_gradient": norm}
+            else:
+                record["critic_gradient"] = self._descend(value_loss, {"value": value_loss}, (self.critic,), "critic")
+            records.append(record)
+        return records
 
     def _value_loss(self, batch: Batch, values: Tensor) -> Tensor:
         targets, clip = batch["targets"], self.settings.value_clip

@@ -114,8 +114,16 @@ def stored(tensors: Seen, dtype: torch.dtype, device: torch.device) -> Seen:
     }
 
 
+def store(tensors: Seen, room: Seen, t: int) -> Seen:
+    """Write an observation into step t of `room`, and return it as it is kept there."""
+    for key, value in tensors.items():
+        kept = room[key][t]
+        kept.copy_(value.to(kept.device, kept.dtype))  # first the numbers, then the layout: the quickest order
+    return {key: value[t] for key, value in room.items()}
+
+
 def room_for(steps: int, tensors: Seen) -> Seen:
-    """Return room for `steps` of what `stored` gave, `[steps, ...]`, images channels last."""
+    """Return room for `steps` of what `stored` gives, `[steps, ...]`, images channels last."""
     room = {}
     for key, value in tensors.items():
         layout = torch.channels_last if value.ndim == 4 else torch.contiguous_format
@@ -167,8 +175,7 @@ def _collect(
 ) -> tuple[Rollout, Observation]:
     agents, device = env.worlds * env.drones, actor.device
     images, sees_level = image_dtype(actor), actor.paradigm != "dtde"
-    seen = stored(agent_tensors(observation, sees_level), images, device)
-    kept = room_for(steps, seen)
+    kept = room_for(steps, stored(agent_tensors(observation, sees_level), images, device))
     actions = torch.empty((steps, agents, actor.taken_size), device=device)
     log_probs, rewards = (torch.empty((steps, agents), device=device) for _ in range(2))
     dones, alive, truncated = (torch.empty((steps, agents), dtype=torch.bool, device=device) for _ in range(3))
@@ -178,8 +185,7 @@ def _collect(
     episodes: list[EpisodeMetrics] = []
     env_s = 0.0
     for t in range(steps):
-        for key, value in seen.items():
-            kept[key][t] = value
+        seen = store(agent_tensors(observation, sees_level), kept, t)
         flying = env.alive.copy()
         alive[t] = torch.from_numpy(flying.reshape(-1))
         if starts is not None:
@@ -199,9 +205,9 @@ def _collect(
         recall.starts = torch.from_numpy(ended.reshape(-1).copy()).to(device)
         episodes.extend(step.episodes)
         observation = step.observation
-        seen = stored(agent_tensors(observation, sees_level), images, device)
+    last = stored(agent_tensors(observation, sees_level), images, device)
     rollout = Rollout(
-        kept, actions, log_probs, rewards, dones, {**seen, "alive": living(env).to(device)}, alive, episodes, env_s,
+        kept, actions, log_probs, rewards, dones, {**last, "alive": living(env).to(device)}, alive, episodes, env_s,
         truncated, env.drones, starts, torch.stack(states) if states else None, recall.copy(),
     )  # fmt: skip
     return rollout, observation

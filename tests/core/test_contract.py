@@ -71,6 +71,17 @@ def test_it_comes_back_the_same(
     assert back.lidar.spec() == LidarSpec(beams=beams, fov=fov, start=-fov / 2)
 
 
+def test_a_memory_or_a_team_makes_it_version_2_and_names_its_inputs() -> None:
+    plain, remembering = contract(paradigm="dtde"), contract(state_size=64)
+    team = contract(paradigm="ctce", level_shape=(5, 32, 32))
+    assert [each.contract_version for each in (plain, remembering, team)] == [1, 2, 2]
+    assert set(plain.inputs) == {"views", "lidar", "motion"}
+    assert remembering.inputs["state"] == (64,)
+    assert team.inputs["level"] == (5, 32, 32)
+    for each in (plain, remembering, team):
+        assert PolicyContract.from_json(each.to_json(), "model.onnx") == each
+
+
 def test_equal_contracts_have_equal_texts() -> None:
     assert contract(training={"a": 1, "b": 2}).to_json() == contract(training={"b": 2, "a": 1}).to_json()
 
@@ -97,7 +108,12 @@ def changed(path: str, value: Any) -> str:
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
-        ("contract_version", 2, "contract_version"),
+        ("contract_version", 3, "contract_version"),
+        ("state_size", 8, "version 1 knows neither a state nor ctce"),
+        ("state_size", -1, "state_size"),
+        ("paradigm", "ctce", "version 1 knows neither a state nor ctce"),
+        ("paradigm", "cctv", "paradigm"),
+        ("level_shape", [5, 32, 32], "level_shape is for the paradigm ctce"),
         ("name", "", "name"),
         ("rate_hz", 0, "rate_hz"),
         ("rate_hz", ..., "key 'rate_hz' is missing"),

@@ -100,7 +100,7 @@ def test_in_the_first_minibatch_the_policy_is_still_the_one_that_flew(env, parad
     cut = Cut(samples, rollout.alive, drones, rollout.sequence_steps, rollout.states, rollout.starts)
     assert rollout.sequence_steps == (1 if memory == "none" else 4)
     with torch.no_grad(), at_precision(precision, actor):
-        batch = next(cut.shuffled(10_000, generator))
+        batch = cut.batch(cut.shuffled(10_000, generator)[0])
         log_probs = log_probability(batch["actions"], batch.of_counted(batch.decide(actor).mean), actor.spread())
     torch.testing.assert_close(log_probs, batch["log_probs"], rtol=0, atol=1e-4 if precision == "float32" else 0.1)
     settings = PPO.model_copy(update={"minibatch": 10_000, "epochs": 1, "precision": precision})
@@ -228,5 +228,6 @@ def test_a_batch_holds_whole_teams_and_whole_sequences_of_the_living(env):
     assert batch["row"].tolist() == [12, 13, 16, 17, 20, 21]
     assert batch.state.flatten().tolist() == [2, 3, 4, 5]
     assert batch.starts.tolist() == [[True, True, False, False]] * 3
-    seen = [row for batch in cut.shuffled(8, torch.Generator().manual_seed(0)) for row in batch["row"].tolist()]
+    pieces = cut.shuffled(8, torch.Generator().manual_seed(0))
+    seen = [row for units in pieces for row in cut.batch(units)["row"].tolist()]
     assert sorted(seen) == sorted([0, 1, 4, 5, 8, 9, 12, 13, 16, 17, 20, 21, 19])
