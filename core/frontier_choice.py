@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from imagine.core.dealing import deal, worth_of
 from imagine.core.frontier import PAD, PLAN_CELL, UNIT_M
+from imagine.core.frontier_gaps import fill_flyable
 from imagine.core.frontier_paths import FAR, search_scratch
 from imagine.core.frontier_targets import MOST_TARGETS, expected_gain, fill_ways, find_targets, gain_rays, nearest_open
 from imagine.core.frontier_ways import follow, trace_back
@@ -33,6 +34,7 @@ _PATH_CELLS = 512
 class ChoiceScratch(NamedTuple):
     """What a thread works with on padded planning grids of one size."""
 
+    kinds: NDArray[np.uint8]
     own: NDArray[np.int16]
     other: NDArray[np.int16]
     marks: NDArray[np.uint8]
@@ -49,7 +51,8 @@ def choice_scratch(rows: int, columns: int) -> ChoiceScratch:
     """Return scratch for padded planning grids of `rows` by `columns`."""
     cells = rows * columns
     return ChoiceScratch(
-        np.empty((rows, columns), np.int16), np.empty((rows, columns), np.int16), np.zeros(cells, np.uint8),
+        np.empty((rows, columns), np.uint8), np.empty((rows, columns), np.int16), np.empty((rows, columns), np.int16),
+        np.zeros(cells, np.uint8),
         np.empty(cells, np.int32), search_scratch(cells), np.empty(MOST_TARGETS, np.int32),
         np.empty(_PATH_CELLS, np.int32), np.empty((rows, columns), np.float32), gain_rays(),
         np.full(1, -1, np.int32),
@@ -58,7 +61,7 @@ def choice_scratch(rows: int, columns: int) -> ChoiceScratch:
 
 @numba.njit(cache=True, nogil=True)
 def fill_frontiers(  # type: ignore[no-untyped-def]
-    frontiers, kinds, states, column0, row0, x, y, turn, positions, ages, memory_s, scratch
+    frontiers, closed, states, belief, column0, row0, x, y, turn, positions, ages, memory_s, scratch
 ):
     """Fill `frontiers` (float32 `[n, FRONTIER_NUMBERS]`) with the n best targets of a drone at (x, y), best first.
 
@@ -67,10 +70,13 @@ def fill_frontiers(  # type: ignore[no-untyped-def]
     gives it to this drone, to a peer; what it may show once the peers have seen theirs; how fresh the nearest peer's
     report is. Metres are over 10,
     ways at most 3, and 3 where nobody gets there; vectors are along axes turned by `turn`. Rows beyond the targets
-    there are stay 0. `kinds` and `states` are padded planning grids whose first cell is map cell (column0, row0);
+    there are stay 0. `closed` (kinds, with narrow gaps still closed) and `states` are padded planning grids of
+    `belief` (int8 `[rows, columns]`), whose first cell is map cell (column0, row0);
     `positions`, `ages` as in `PeerPoses`, of peers heard within `memory_s`.
     """
     frontiers[:] = 0.0
+    kinds = scratch.kinds
+    fill_flyable(kinds, closed, states, belief)
     columns = kinds.shape[1]
     at_row, at_column = y / PLAN_CELL - row0 // 2 + PAD, x / PLAN_CELL - column0 // 2 + PAD
     start = nearest_open(kinds, math.floor(at_row), math.floor(at_column), _OWN_RINGS)

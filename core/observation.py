@@ -312,7 +312,7 @@ def observe(
         known = peers or PeerPoses.none()
         rows, columns = field.kinds.shape
         fill_frontiers(
-            observation["frontiers"], field.kinds, field.padded_states, origin_cells[0], origin_cells[1],
+            observation["frontiers"], field.kinds, field.padded_states, belief, origin_cells[0], origin_cells[1],
             pose.x, pose.y, turn, known.positions, known.ages_s, spec.peer_memory_s, choice_scratch(rows, columns),
         )  # fmt: skip
     return observation

@@ -95,7 +95,20 @@ def fill_visit_views(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def fill_frontier_choices(  # type: ignore[no-untyped-def]
-    first, last, frontiers, kinds, states, origins, poses, positions, ages, memory_s, heading_axes, alive, scratch
+    first,
+    last,
+    frontiers,
+    kinds,
+    states,
+    belief,
+    origins,
+    poses,
+    positions,
+    ages,
+    memory_s,
+    heading_axes,
+    alive,
+    scratch,
 ):
     """Fill `frontiers` (float32 `[world, drone, n, numbers]`) with what the living can choose from."""
     for world in range(first, last):
@@ -104,7 +117,7 @@ def fill_frontier_choices(  # type: ignore[no-untyped-def]
                 continue
             x, y, yaw = poses[world, drone]
             fill_frontiers(
-                frontiers[world, drone], kinds[world, drone], states[world, drone], origins[world, 0],
+                frontiers[world, drone], kinds[world, drone], states[world, drone], belief[world, drone], origins[world, 0],
                 origins[world, 1], x, y, yaw if heading_axes else 0.0, positions[world, drone], ages[world, drone],
                 memory_s, scratch,
             )  # fmt: skip

@@ -124,6 +124,7 @@ class DecisionState:
         frontiers: NDArray[np.float32],
         kinds: NDArray[np.uint8],
         states: NDArray[np.uint8],
+        belief: NDArray[np.int8],
         poses: NDArray[np.float64],
         origins: NDArray[np.int64],
         alive: NDArray[np.bool_],
@@ -131,11 +132,12 @@ class DecisionState:
     ) -> None:
         """Fill what drones can choose from, `[worlds, drones, n, numbers]`, in the `shown` worlds (`[worlds]`).
 
-        `kinds` and `states` are the padded planning grids of their maps, uint8 `[worlds, drones, rows, columns]`.
+        `kinds` and `states` are the padded planning grids of their maps, uint8 `[worlds, drones, rows, columns]`,
+        and `belief` the maps themselves, int8.
         """
         spec = self._spec
         self._workers.over(
-            len(poses), fill_frontier_choices, frontiers, kinds, states, origins, poses, self.positions, self.ages,
+            len(poses), fill_frontier_choices, frontiers, kinds, states, belief, origins, poses, self.positions, self.ages,
             spec.peer_memory_s, spec.axes == "heading", alive & shown[:, None], scratch=self._choice_scratch,
         )  # fmt: skip
 

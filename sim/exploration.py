@@ -301,7 +301,7 @@ class Exploration:
             self.decisions.fill(seen["views"], seen["motion"], self.estimates, self.maps.origins)
             if self.settings.observation.frontiers:
                 self.decisions.fill_frontiers(
-                    seen["frontiers"], maps.kinds, maps.states, self.estimates, self.maps.origins, self.alive,
+                    seen["frontiers"], maps.kinds, maps.states, maps.belief, self.estimates, self.maps.origins, self.alive,
                     shown != WAITING,
                 )  # fmt: skip
 

@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from imagine.core.dealing import coordinated_target
-from imagine.core.frontier import FREE, OCCUPIED, PAD, UNKNOWN, refresh_kinds
+from imagine.core.frontier import FREE, OCCUPIED, PAD, UNKNOWN, refresh_kinds, refresh_states
+from imagine.core.frontier_gaps import fill_flyable
 from imagine.core.frontier_paths import BLOCKED, FAR, FRONTIER, NEAR, OPEN, search_scratch
 from imagine.core.frontier_targets import (
+    claim,
     expected_gain,
     fill_ways,
     find_targets,
@@ -228,22 +230,20 @@ def test_two_drones_take_two_equal_frontiers(form: int) -> None:
 
 
 def test_what_a_peer_will_see_is_left_to_it_unless_a_wall_is_between() -> None:
-    """The peer takes one of two frontiers of the same unknown; a wall makes them frontiers of two."""
+    """Of two frontiers of one unknown region the second is worth less once the first is dealt out."""
     inner = np.full((40, 40), FREE, np.uint8)
     inner[:14, 10:30] = UNKNOWN
-    inner[:10, :] = UNKNOWN
-    inner[38:, 30:] = UNKNOWN  # a little more, far away
     open_states, _ = grid(inner)
     inner[:24, 20] = OCCUPIED
     walled, _ = grid(inner)
     columns = walled.shape[1]
-    targets = np.array(
-        [(14 + PAD) * columns + 17 + PAD, (14 + PAD) * columns + 23 + PAD, (37 + PAD) * columns + 35], np.int32
-    )
-    ways = np.array([[2.0, 2.0, 5.0], [0.0, 9.0, 9.0]])
-    assert deal(open_states, targets, ways, 0.01, 0, 0.0) == 1
-    assert deal(walled, targets, ways, 0.01, 0, 1.0) == 1
-    assert deal(open_states, targets, ways, 0.01, 0, 1.0) == 2
+    first, second = (14 + PAD) * columns + 18 + PAD, (14 + PAD) * columns + 22 + PAD
+    for states, least, most in ((open_states, 0.5, 0.8), (walled, 1.0, 1.0)):
+        left = np.ones(states.shape, np.float32)
+        before = expected_gain(states, left, second, REACH, RAYS)
+        claim(left, states, first, REACH, RAYS, 1.0)
+        assert least <= expected_gain(states, left, second, REACH, RAYS) / before <= most
+        assert expected_gain(states, left, first, REACH, RAYS) < 0.75 * before
 
 
 def test_nothing_to_deal_is_no_target() -> None:
@@ -293,3 +293,23 @@ def test_no_line_runs_through_obstacles_or_the_unknown() -> None:
     assert near_on_line(kinds, 10.5, 4.5, 10.5, 17.5) == -1.0
     assert near_on_line(kinds, 3.5, 5.5, 12.5, 5.5) == -1.0
     assert near_on_line(kinds, 10.5, 4.5, -40.0, 4.5) == -1.0
+
+
+@pytest.mark.parametrize("shift", [0, 1])
+@pytest.mark.parametrize(("width", "is_open"), [(5, True), (4, True), (3, False), (2, False)])
+def test_a_gap_is_open_wherever_it_lies_on_the_grid(shift: int, width: int, is_open: bool) -> None:
+    """A wall with a gap of so many map cells of 0.1 m parts two rooms; 0.3 m is too narrow for a drone."""
+    belief = np.full((64, 64), -8, np.int8)
+    belief[:, 30:33] = 8
+    belief[20 + shift : 20 + shift + width, 30:33] = -8
+    states = np.zeros((32 + 2 * PAD, 32 + 2 * PAD), np.uint8)
+    for i in range(2):
+        for j in range(2):
+            refresh_states(belief, states, i, j)
+    _, kinds = grid(states[PAD:-PAD, PAD:-PAD])
+    flyable = np.empty_like(kinds)
+    fill_flyable(flyable, kinds, states, belief)
+    columns = kinds.shape[1]
+    ways = ways_from(flyable, (10 + PAD) * columns + 5 + PAD)
+    assert (ways.ravel()[(10 + PAD) * columns + 25 + PAD] < FAR) == is_open
+    np.testing.assert_array_equal(flyable[kinds != 0], kinds[kinds != 0])

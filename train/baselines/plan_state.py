@@ -22,10 +22,11 @@ class PlanState(NamedTuple):
     """Arrays `[worlds, drones, ...]`; cells are flat indices of the padded planning grid, -1 for none.
 
     The choice that stands: `goal`, its `path` and `length`, the point `at` of it last passed, its `age` in decisions;
-    `due` says that it is to be made anew, and `dealt` which of the `targets` was drawn. What it is made from: `cost`
-    the own ways, `found` targets, `ways` `[..., robots, targets]` metres from the drone itself and `robots` - 1 peers,
-    `utility`. The watchdog: `banned` frontiers `until` which decision by `clock`, where the drone was (`anchor`,
-    metres) when it last got on, `still` decisions ago, and `told`, the intent that it was advised.
+    `due` says that it is to be made anew, and `dealt` which of the `targets` was drawn. What it is made from: `kinds`
+    with gaps opened (see `gaps`), `cost` the own ways, `found` targets, their `utility`, and `ways`
+    `[..., robots, targets]`, metres, from the drone itself and `robots` - 1 peers. The watchdog: `banned` frontiers
+    `until` which decision by `clock`, where the drone was (`anchor`, metres) when it last got on, `still` decisions
+    ago, and `told`, the intent that it was advised.
     """
 
     goal: NDArray[np.int32]
@@ -35,6 +36,7 @@ class PlanState(NamedTuple):
     age: NDArray[np.int32]
     due: NDArray[np.bool_]
     dealt: NDArray[np.int32]
+    kinds: NDArray[np.uint8]
     cost: NDArray[np.int16]
     targets: NDArray[np.int32]
     found: NDArray[np.int32]
@@ -55,9 +57,9 @@ def plan_state(worlds: int, drones: int, rows: int, columns: int) -> PlanState:
     state = PlanState(
         goal=np.empty(size, np.int32), path=np.empty((*size, PATH_CELLS), np.int32), length=np.empty(size, np.int32),
         at=np.empty(size, np.int32), age=np.empty(size, np.int32), due=np.empty(size, np.bool_),
-        dealt=np.empty(size, np.int32), cost=np.empty((*size, rows, columns), np.int16),
-        targets=np.empty((*size, MOST_TARGETS), np.int32), found=np.empty(size, np.int32),
-        ways=np.empty((*size, drones, MOST_TARGETS)), robots=np.empty(size, np.int32),
+        dealt=np.empty(size, np.int32), kinds=np.empty((*size, rows, columns), np.uint8),
+        cost=np.empty((*size, rows, columns), np.int16), targets=np.empty((*size, MOST_TARGETS), np.int32),
+        found=np.empty(size, np.int32), ways=np.empty((*size, drones, MOST_TARGETS)), robots=np.empty(size, np.int32),
         utility=np.empty((*size, MOST_TARGETS)), banned=np.empty((*size, BANNED), np.int32),
         until=np.empty((*size, BANNED), np.int64), clock=np.empty(size, np.int64), anchor=np.empty((*size, 2)),
         still=np.empty(size, np.int32), told=np.empty((*size, 2)),

@@ -14,6 +14,7 @@ import numpy as np
 from imagine.core.action import action_toward_kernel, intent_kernel
 from imagine.core.dealing import coordinated_target
 from imagine.core.frontier import PAD, PLAN_CELL, UNIT_M
+from imagine.core.frontier_gaps import fill_flyable
 from imagine.core.frontier_paths import FAR, FRONTIER
 from imagine.core.frontier_targets import distance_m, expected_gain, fill_ways, find_targets, nearest_open
 from imagine.core.frontier_ways import follow, trace_back
@@ -94,7 +95,8 @@ def survey_worlds(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _survey(state, maps, world, drone, x, y, peers, tick, ticks_per_s, parameters, rays, scratch):  # type: ignore[no-untyped-def]
-    kinds, states, origin = maps.kinds[world, drone], maps.states[world, drone], maps.origins[world]
+    kinds, states, origin = state.kinds[world, drone], maps.states[world, drone], maps.origins[world]
+    fill_flyable(kinds, maps.kinds[world, drone], states, maps.belief[world, drone])
     targets, ways, utility = state.targets[world, drone], state.ways[world, drone], state.utility[world, drone]
     columns = kinds.shape[1]
     row, column = _cell_of(x, y, origin)
@@ -164,7 +166,7 @@ def fly_worlds(first, last, actions, state, maps, poses, alive, action_parameter
         for drone in range(poses.shape[1]):
             if not alive[world, drone]:
                 continue
-            kinds, states = maps.kinds[world, drone], maps.states[world, drone]
+            kinds, states = state.kinds[world, drone], maps.states[world, drone]
             x, y, yaw = poses[world, drone, 0], poses[world, drone, 1], poses[world, drone, 2]
             row, column = _cell_of(x, y, maps.origins[world])
             path = state.path[world, drone]

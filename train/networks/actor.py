@@ -134,7 +134,7 @@ class Actor(Computing):
                     features, state = self.gated.sequence(features, state, starts)
         features = features.float()
         if self.choice is not None:
-            scores = self.choice(seen["frontiers"], features)
+            scores = self.choice(seen["frontiers"], features, seen["motion"][:, :2])
             return Decisions(self.flown(seen, scores.argmax(dim=1, keepdim=True)), features, state, scores)
         wanted = self.mean(features)
         if self.steering is not None:

@@ -20,12 +20,17 @@ class ChoiceHead(nn.Module):
     def __init__(self, numbers: int, features: int, hidden: int) -> None:
         super().__init__()
         self.features = orthogonal(nn.Linear(features, hidden))
-        self.each = orthogonal(nn.Linear(numbers, hidden))
+        self.each = orthogonal(nn.Linear(numbers + 1, hidden))
         self.mixed = orthogonal(nn.Linear(hidden, hidden))
         self.score = orthogonal(nn.Linear(hidden, 1), gain=0.1)  # begin undecided
 
-    def forward(self, frontiers: Tensor, features: Tensor) -> Tensor:
-        """Return scores, `[rows, n]`, far below all others where no frontier is shown."""
+    def forward(self, frontiers: Tensor, features: Tensor, velocity: Tensor) -> Tensor:
+        """Return scores, `[rows, n]`, far below all others where no frontier is shown.
+
+        `velocity` `[rows, 2]` along the observation's axes: a choice is held to by knowing what one is flying to.
+        """
+        along = (frontiers[..., 1:3] * velocity.unsqueeze(1)).sum(dim=2, keepdim=True)
+        frontiers = torch.cat([frontiers, along], dim=2)
         hidden = torch.relu(self.each(frontiers) + self.features(features).unsqueeze(1))
         hidden = torch.relu(self.mixed(hidden))
         scores: Tensor = self.score(hidden).squeeze(2)
