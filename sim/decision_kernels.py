@@ -117,7 +117,7 @@ def fill_frontier_choices(  # type: ignore[no-untyped-def]
                 continue
             x, y, yaw = poses[world, drone]
             fill_frontiers(
-                frontiers[world, drone], kinds[world, drone], states[world, drone], belief[world, drone], origins[world, 0],
-                origins[world, 1], x, y, yaw if heading_axes else 0.0, positions[world, drone], ages[world, drone],
-                memory_s, scratch,
+                frontiers[world, drone], kinds[world, drone], states[world, drone], belief[world, drone],
+                origins[world, 0], origins[world, 1], x, y, yaw if heading_axes else 0.0, positions[world, drone],
+                ages[world, drone], memory_s, scratch,
             )  # fmt: skip

@@ -137,8 +137,8 @@ class DecisionState:
         """
         spec = self._spec
         self._workers.over(
-            len(poses), fill_frontier_choices, frontiers, kinds, states, belief, origins, poses, self.positions, self.ages,
-            spec.peer_memory_s, spec.axes == "heading", alive & shown[:, None], scratch=self._choice_scratch,
+            len(poses), fill_frontier_choices, frontiers, kinds, states, belief, origins, poses, self.positions,
+            self.ages, spec.peer_memory_s, spec.axes == "heading", alive & shown[:, None], scratch=self._choice_scratch,
         )  # fmt: skip
 
     def decide(self, actions: NDArray[np.float32], poses: NDArray[np.float64]) -> None:

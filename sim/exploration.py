@@ -301,8 +301,8 @@ class Exploration:
             self.decisions.fill(seen["views"], seen["motion"], self.estimates, self.maps.origins)
             if self.settings.observation.frontiers:
                 self.decisions.fill_frontiers(
-                    seen["frontiers"], maps.kinds, maps.states, maps.belief, self.estimates, self.maps.origins, self.alive,
-                    shown != WAITING,
+                    seen["frontiers"], maps.kinds, maps.states, maps.belief, self.estimates, self.maps.origins,
+                    self.alive, shown != WAITING,
                 )  # fmt: skip
 
     def time_stages(self) -> None:
