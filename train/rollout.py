@@ -62,9 +62,17 @@ def actor_inputs(tensors: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
 
 @torch.no_grad()
 def collect(
-    env: Exploration, observation: Observation, actor: Actor, steps: int, generator: torch.Generator
+    env: Exploration,
+    observation: Observation,
+    actor: Actor,
+    steps: int,
+    generator: torch.Generator,
+    noise: Tensor | None = None,
 ) -> tuple[Rollout, Observation]:
-    """Act `steps` times by draws from the policy; return the rollout and the observation to go on from."""
+    """Act `steps` times by draws from the policy; return the rollout and the observation to go on from.
+
+    `noise` `[steps, agents, action size]`, standard normal, is taken instead of draws from `generator`.
+    """
     agents = env.worlds * env.drones
     tensors = agent_tensors(observation)
     kept = {key: torch.empty((steps, *value.shape), dtype=value.dtype) for key, value in tensors.items()}
@@ -78,7 +86,8 @@ def collect(
         for key, value in tensors.items():
             kept[key][t] = value
         mean, log_std = actor(*actor_inputs(tensors)), actor.spread()
-        actions[t] = mean + log_std.exp() * torch.randn((agents, action_size), generator=generator)
+        draws = torch.randn((agents, action_size), generator=generator) if noise is None else noise[t]
+        actions[t] = mean + log_std.exp() * draws
         log_probs[t] = log_probability(actions[t], mean, log_std)
         alive[t] = torch.from_numpy(env.alive.reshape(-1))
         began = time.perf_counter()
