@@ -16,8 +16,15 @@ from imagine.core.errors import InputError, WorkError
 
 _LOOPBACK = "127.0.0.1"
 _REACH_S = 5.0
-_ANSWER_S = 30.0
+_ANSWER_S = 20.0
 _STARTS = 3
+_ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # Ray's coming default, which it asks to be chosen
+    "RAY_AIR_NEW_OUTPUT": "0",  # the command prints, not Tune
+    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",  # run folders hold metrics already
+    "TUNE_FORCE_TRIAL_CLEANUP_S": "20",  # trials that do not stop by then are killed; by default it waits 10 minutes
+}
 
 
 @contextlib.contextmanager
@@ -31,9 +38,7 @@ def ray_connection(address: str | None = None, cpus: int | None = None) -> Itera
     """
     if find_spec("ray") is None:
         raise InputError("studies need Ray: pip install imagine-swarm[study]")
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    os.environ["TUNE_DISABLE_AUTO_CALLBACK_LOGGERS"] = "1"  # run folders hold metrics already
-    os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] = "0"  # Ray's coming default, which it asks to be chosen
+    os.environ.update(_ENVIRONMENT)
     if address is None:
         with _own_cluster(cpus or len(os.sched_getaffinity(0))):
             yield

@@ -25,48 +25,37 @@ from imagine.train.study.settings import StudySettings
 
 
 class StudyFolder:
-    """Where a study is kept. `create` begins it, `reopen` goes on with it."""
+    """Where a study is kept: look whether it may run there (`check_new`, `check_known`), then `write` it."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.tune = path / ".tune"
+    def __init__(self, study: StudySettings) -> None:
+        self.path = study.folder
+        self.tune = self.path / ".tune"
         """Tune's own scratch; what a study goes on from is in the trials' run folders."""
 
-    @staticmethod
-    def create(study: StudySettings, trials: Sequence[Trial]) -> StudyFolder:
-        """Begin a study's folder. Raises InputError when there is one of that name."""
-        folder = StudyFolder(study.folder)
-        if (folder.path / "study.yaml").exists():
+    def check_new(self) -> None:
+        """Raise InputError when there is a study of that name."""
+        if (self.path / "study.yaml").exists():
             raise InputError(
-                f"{folder.path}: there is a study of this name; go on with --resume, or choose another with --set name=…"
+                f"{self.path}: there is a study of this name; go on with --resume, or choose another with --set name=…"
             )
-        folder._write(study, trials)
-        return folder
 
-    @staticmethod
-    def reopen(study: StudySettings, trials: Sequence[Trial]) -> StudyFolder:
-        """Open a study's folder to go on with it; a study may have got more trials, not others.
-
-        Raises InputError when there is none, or a trial in it has other settings now.
-        """
-        folder = StudyFolder(study.folder)
-        if not (folder.path / "study.yaml").exists():
-            raise InputError(f"{folder.path}: no study to resume; start it without --resume")
-        known = {path.stem for path in (folder.path / "configs").glob("*.yaml")}
+    def check_known(self, trials: Sequence[Trial]) -> None:
+        """Raise InputError when there is no study, or one with other trials; it may have got more of them."""
+        if not (self.path / "study.yaml").exists():
+            raise InputError(f"{self.path}: no study to resume; start it without --resume")
+        known = {path.stem for path in (self.path / "configs").glob("*.yaml")}
         gone = sorted(known - {trial.name for trial in trials})
         changed = [
             trial.name
             for trial in trials
-            if trial.name in known and load_train_settings(folder.config(trial.name)) != trial.settings
+            if trial.name in known and load_train_settings(self.config(trial.name)) != trial.settings
         ]
         if gone or changed:
             what = f"trial {gone[0]} is not in it any more" if gone else f"trial {changed[0]} has other settings now"
-            raise InputError(f"{folder.path}: the study has changed: {what}; start it under another name, --set name=…")
-        folder._write(study, [trial for trial in trials if trial.name not in known])
-        return folder
+            raise InputError(f"{self.path}: the study has changed: {what}; start it under another name, --set name=…")
 
-    def _write(self, study: StudySettings, trials: Sequence[Trial]) -> None:
-        """Write the study's settings and those of `trials`; the study's last, for it says that all are there."""
+    def write(self, study: StudySettings, trials: Sequence[Trial]) -> None:
+        """Write the settings of the trials, and the study's last, for it says that all are there."""
         for trial in trials:
             _write_yaml(self.config(trial.name), trial.settings.model_dump(mode="json"))
         _write_yaml(self.path / "study.yaml", study.model_dump(mode="json"))
@@ -74,7 +63,12 @@ class StudyFolder:
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Keep other processes from running the same study. Raises InputError where one does already."""
-        with (self.path / ".lock").open("w") as file:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock = (self.path / ".lock").open("w")
+        except OSError as error:
+            raise InputError(f"{self.path}: the study's folder cannot be written: {error.strerror}") from error
+        with lock as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import signal
 import threading
@@ -46,15 +47,22 @@ def run_study(
     for settings, folders and addresses that are wrong, before any trial starts; WorkError where the cluster is lost.
     """
     trials = plan_trials(study)
-    folder = StudyFolder.reopen(study, trials) if resume else StudyFolder.create(study, trials)
-    stopped = False
+    folder = StudyFolder(study)
     with folder.locked():
+        if resume:
+            folder.check_known(trials)
+        else:
+            folder.check_new()
         left = [trial for trial in trials if not _ended(folder, trial)]
-        if left:
+        again = trials if study.search == "asha" else left  # ASHA compares with those that ended, too
+        stopped = False
+        with ray_connection(address, cpus) if left else contextlib.nullcontext():
+            if left:
+                _check_room(study, left)
+            folder.write(study, trials)
             for trial in left:
                 (folder.run(trial.name) / "outcome.json").unlink(missing_ok=True)  # it failed; a new try
-            again = trials if study.search == "asha" else left  # ASHA compares with those that ended, too
-            with ray_connection(address, cpus):
+            if left:
                 stopped = _fit(study, folder, again, address, tell or _log)
     return StudyResult(folder, trials, {trial.name: folder.outcome(trial.name) for trial in trials}, stopped)
 
@@ -71,7 +79,6 @@ def _fit(study: StudySettings, folder: StudyFolder, trials: Sequence[Trial], add
     from imagine.train.study.lost_cluster import LostCluster
     from imagine.train.study.tune_events import Events
 
-    _check_room(study, trials)
     tasks = [asdict(_task(study, folder, trial)) for trial in trials]
     bundles = {trial.name: _bundles(study, trial) for trial in trials}
     events = Events(tell, lambda name, error: _close(folder, name, error))
@@ -83,6 +90,7 @@ def _fit(study: StudySettings, folder: StudyFolder, trials: Sequence[Trial], add
             max_concurrent_trials=study.max_concurrent,
             trial_name_creator=_name,
             trial_dirname_creator=_name,
+            reuse_actors=True,  # a worker that has ended a trial has everything loaded for the next
         ),
         run_config=tune.RunConfig(
             name=folder.tune.name,
@@ -92,7 +100,7 @@ def _fit(study: StudySettings, folder: StudyFolder, trials: Sequence[Trial], add
             verbose=0,
         ),
     )
-    logging.getLogger("ray").setLevel(logging.ERROR)
+    logging.getLogger("ray.tune").setLevel(logging.CRITICAL)  # events tell what fails
     with _sigterm_as_sigint(), LostCluster(address, events, study.silent_s) as watch:
         try:
             tuner.fit()
