@@ -243,7 +243,8 @@ def train(
 def study(
     file: Annotated[Path, typer.Argument(metavar="STUDY", help="a study's YAML, or a packaged one such as paradigms")],
     address: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="head of a Ray cluster; by default one of this machine's own")
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="head of a Ray cluster; by default one of this machine's own"),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="keep the trials that ended, go on with the others")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="check and show the trials, run none")] = False,

@@ -15,6 +15,7 @@ from rich.table import Table
 from imagine.core.errors import InputError, WorkError
 from imagine.outputs import write_json
 from imagine.train.study.events import Event
+from imagine.train.study.folder import StudyFolder
 from imagine.train.study.plan import Trial, plan_trials, total_steps
 from imagine.train.study.plot import plot_summary
 from imagine.train.study.results import METRICS, study_data, write_results
@@ -34,7 +35,7 @@ def study_and_show(
     overrides: list[str],
     json_file: Path | None,
 ) -> None:
-    """Run a study, or with `dry_run` only show its trials; print its conditions and write all results.
+    """Run a study, print its conditions and write all results; with `dry_run` only check and show its trials.
 
     Raises InputError for what is wrong before the first trial; WorkError when trials failed or the study was stopped,
     after the results so far are written.
@@ -45,6 +46,8 @@ def study_and_show(
         raise InputError(f"{error}{_packaged(file)}") from error
     trials = plan_trials(study)
     if dry_run:
+        if resume:
+            StudyFolder(study).check_known(trials)
         _show_plan(study, trials)
         return
     print(f"{study.folder}: {len(trials)} trials", file=sys.stderr)
@@ -119,4 +122,3 @@ def _cell(row: dict[str, Any], name: str) -> str:
         return "–"
     interval = row[f"{name}_ci95"]
     return f"{row[name]:.3g}" + (f" ± {(interval[1] - interval[0]) / 2.0:.2g}" if interval else "")
-

@@ -16,7 +16,10 @@ def study(**changes):
 def test_every_combination_of_variants_grid_and_repeats_is_a_trial_of_its_own():
     trials = plan_trials(
         study(
-            variants=[{"name": "near", "set": ["env.radio.range_m=2"]}, {"name": "far", "set": ["env.radio.range_m=9"]}],
+            variants=[
+                {"name": "near", "set": ["env.radio.range_m=2"]},
+                {"name": "far", "set": ["env.radio.range_m=9"]},
+            ],
             parameters={"grid": {"env.drones": [1, 2, 3], "env.levels": [["0"], ["0", "1"]]}},
             repeats=2,
             seed=5,
@@ -81,7 +84,10 @@ def test_a_study_stops_its_trials_at_so_many_steps_of_both_phases():
         ({"parameters": {"grid": {"ppo.clip": [0.1, 2]}}}, r"study s: ppo\.clip=2: .*ppo\.clip: "),
         ({"variants": [{"name": "a", "set": ["env.drone=2"]}]}, r"study s: a: .*did you mean 'drones'"),
         ({"base": "nowhere"}, "nowhere"),
-        ({"parameters": {"grid": {"ppo.epochs": list(range(1, 200)), "run.keep_checkpoints": list(range(1, 60))}}}, "10000"),
+        (
+            {"parameters": {"grid": {"ppo.epochs": list(range(1, 200)), "run.keep_checkpoints": list(range(1, 60))}}},
+            "10000",
+        ),
     ],
 )
 def test_a_wrong_setting_of_any_trial_is_refused_before_the_first_starts(changes, message):
@@ -94,7 +100,10 @@ def test_a_wrong_setting_of_any_trial_is_refused_before_the_first_starts(changes
     [
         ("name: s\nrepeat: 2\n", r"mine\.yaml:2: unknown key 'repeat'; did you mean 'repeats'"),
         ("name: s\nparameters: {grit: {}}\n", r"unknown key 'parameters\.grit'; did you mean 'grid'"),
-        ("name: s\nparameters: {grid: {run.seed: [1, 2]}}\n", "run.seed cannot be set by a study: use seed and repeats"),
+        (
+            "name: s\nparameters: {grid: {run.seed: [1, 2]}}\n",
+            "run.seed cannot be set by a study: use seed and repeats",
+        ),
         ("name: s\nparameters: {space: {ppo.clip: {uniform: [0.1, 0.2]}}}\n", "say random or asha"),
         ("name: s\nsamples: 3\n", "no parameters.space to draw from"),
         ("name: s\nvariants: [{name: a}, {name: a}]\n", "two are called a"),
@@ -169,6 +178,6 @@ def test_every_trial_of_a_packaged_study_is_valid_and_it_says_what_it_asks(name)
 
 def test_the_papers_experiments_are_there():
     assert {path.stem for path in STUDIES.glob("*.yaml")} >= {
-        "paradigms", "communication", "kill_on_collision", "curriculum", "actions_observations", "lidar_convolution", "rnn",
-        "asha",
+        "paradigms", "communication", "kill_on_collision", "curriculum", "actions_observations", "lidar_convolution",
+        "rnn", "asha",
     }  # fmt: skip

@@ -19,7 +19,12 @@ from imagine.train.study.trial import outcome_of
 def data(tmp_path):
     """Two conditions with three repeats each, one of whose trials failed, and one that has not ended."""
     study = StudySettings(
-        name="s", base="smoke", root=str(tmp_path), parameters={"grid": {"env.drones": [1, 2, 3]}}, repeats=3, metric="t90"
+        name="s",
+        base="smoke",
+        root=str(tmp_path),
+        parameters={"grid": {"env.drones": [1, 2, 3]}},
+        repeats=3,
+        metric="t90",
     )
     trials = plan_trials(study)
     outcomes = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import secrets
 import socket
@@ -59,13 +60,13 @@ def _own_cluster(cpus: int) -> Iterator[None]:
         os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
     import ray
 
-    if ray._private.ray_constants.ENABLE_RAY_CLUSTER:  # type: ignore[attr-defined]
+    if ray._private.ray_constants.ENABLE_RAY_CLUSTER:
         raise WorkError("ray was imported before it could be bound to loopback; start studies in a new process")
     with tempfile.TemporaryDirectory(prefix="imagine-ray-", ignore_cleanup_errors=True) as folder:
         for attempt in range(1, _STARTS + 1):
             try:
                 ray.init(
-                    address="local", num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level="ERROR",
+                    address="local", num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR,
                     _node_ip_address=_LOOPBACK, _temp_dir=folder,
                 )  # fmt: skip
                 break
@@ -85,7 +86,7 @@ def _cluster_at(address: str) -> Iterator[None]:
     import ray
 
     try:
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, RuntimeError, ValueError) as error:
         raise InputError(f"--address {address}: Ray cannot join this cluster from here: {error}") from error
     try:

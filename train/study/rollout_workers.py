@@ -7,7 +7,9 @@ for a rollout: how many workers share the worlds changes only how sums over a ba
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
+import sys
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
@@ -62,9 +64,7 @@ class OwnRollouts:
 class RolloutWorkers:
     """Rollouts flown by `workers` workers of the cluster that this process is connected to, one CPU each."""
 
-    def __init__(
-        self, settings: ExplorationSettings, seed: int, actor: Actor, workers: int, state: Any = None
-    ) -> None:
+    def __init__(self, settings: ExplorationSettings, seed: int, actor: Actor, workers: int, state: Any = None) -> None:
         """Start the workers; `state` is what `state_dict` gave, of as many workers.
 
         Raises InputError where there are more workers than worlds, or `state` is of another number of them;
@@ -81,7 +81,7 @@ class RolloutWorkers:
         self._drones, self._action_size = settings.drones, settings.action.size
         remote = ray.remote(num_cpus=1, max_restarts=0)(_Worker)
         shared = ray.put(actor)
-        self._workers = [
+        self._workers: list[Any] = [
             remote.remote(settings.model_copy(update={"worlds": len(keys)}), seed, list(keys), shared, own)
             for keys, own in zip(self._parts, states, strict=True)
         ]
@@ -100,7 +100,7 @@ class RolloutWorkers:
         noise = [torch.randn((agents, self._action_size), generator=generator).numpy() for _ in range(steps)]
         weights = ray.put({name: value.numpy() for name, value in actor.state_dict().items()})
         bounds = np.cumsum([0, *(len(keys) * self._drones for keys in self._parts)])
-        draws = [np.stack([step[a:b] for step in noise]) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        draws = [np.stack([step[a:b] for step in noise]) for a, b in itertools.pairwise(bounds)]
         pieces = self._ask("collect", _COLLECT_S, [(weights, own) for own in draws])
         return _joined(pieces)
 
@@ -138,10 +138,9 @@ def rollout_workers(
     settings: ExplorationSettings, seed: int, actor: Actor, workers: int, state: Any = None
 ) -> Iterator[RolloutWorkers]:
     """Start rollout workers for a while: in the cluster this process is in already, or in one of its own."""
-    import ray
-
     with contextlib.ExitStack() as stack:
-        if not ray.is_initialized():
+        ray = sys.modules.get("ray")  # to import it is to settle where it listens: that is ray_connection's to do
+        if ray is None or not ray.is_initialized():
             stack.enter_context(ray_connection(cpus=workers))
         started = RolloutWorkers(settings, seed, actor, workers, state)
         stack.callback(started.close)
@@ -151,15 +150,13 @@ def rollout_workers(
 def _parts(worlds: int, workers: int) -> list[range]:
     """Split worlds into contiguous parts whose sizes differ by one at most."""
     bounds = [worlds * part // workers for part in range(workers + 1)]
-    return [range(first, last) for first, last in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [range(first, last) for first, last in itertools.pairwise(bounds)]
 
 
 class _Worker:
     """What runs in a worker's process. Tensors travel as arrays, which Ray shares without copying."""
 
-    def __init__(
-        self, settings: ExplorationSettings, seed: int, keys: Sequence[int], actor: Actor, state: Any
-    ) -> None:
+    def __init__(self, settings: ExplorationSettings, seed: int, keys: Sequence[int], actor: Actor, state: Any) -> None:
         os.environ["IMAGINE_THREADS"] = "1"
         torch.set_num_threads(1)
         self._env = Exploration(settings, seed, world_keys=keys)

@@ -141,7 +141,7 @@ def _check_room(study: StudySettings, trials: Sequence[Trial]) -> None:
     """Raise InputError where some trial would wait for ever."""
     import ray
 
-    there = ray.cluster_resources()
+    there: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
     for trial in trials:
         bundles = _bundles(study, trial)
         for kind in ("CPU", "GPU"):
@@ -158,7 +158,7 @@ def _scheduler(study: StudySettings, trials: Sequence[Trial]) -> Any:
     from ray.tune.schedulers import ASHAScheduler, FIFOScheduler
 
     if study.search != "asha":
-        return FIFOScheduler()
+        return FIFOScheduler()  # type: ignore[no-untyped-call]
     longest = max(total_steps(trial.settings) for trial in trials)
     grace = min(study.asha.grace_agent_steps, longest)
     return ASHAScheduler(
@@ -206,5 +206,3 @@ def _sigterm_as_sigint() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-

@@ -201,5 +201,7 @@ class Watchdog:
     def _watch(self) -> None:
         while not self._over.wait(max(0.1, self._fed + self._silent_s - time.monotonic())):
             if time.monotonic() - self._fed >= self._silent_s:
-                self._note.write_text(f"nothing was reported for {self._silent_s:g} s: the worker ended itself\n", "utf-8")
+                self._note.write_text(
+                    f"nothing was reported for {self._silent_s:g} s: the worker ended itself\n", "utf-8"
+                )
                 os.kill(os.getpid(), signal.SIGKILL)  # nothing gentler ends a thread that hangs in compiled code

@@ -10,8 +10,10 @@ from ray.tune import Callback
 
 from imagine.train.study.events import Event, Kind, Tell
 
+_NUMBERS: tuple[str, ...] = ("agent_steps", "coverage", "t90", "contacts")
 
-class Events(Callback):  # type: ignore[misc]
+
+class Events(Callback):
     """Hears Tune's calls and passes them on; `close(trial, error)` is called when Tune has ended one."""
 
     def __init__(self, tell: Tell, close: Callable[[str, str | None], None]) -> None:
@@ -22,7 +24,7 @@ class Events(Callback):  # type: ignore[misc]
     def _pass(self, trial: Any, kind: Kind, result: dict[str, Any] | None = None, error: str = "") -> None:
         self.newest = time.monotonic()
         told = result or {}
-        numbers = {name: float(told[name]) for name in ("agent_steps", "coverage", "t90", "contacts") if name in told}
+        numbers: dict[str, float] = {name: float(told[name]) for name in _NUMBERS if name in told}
         name = str(trial.config["task"]["name"])
         self._tell(Event(name, kind, numbers, told.get("pid"), str(told.get("hostname", "")), error))
 
