@@ -66,8 +66,8 @@ def _own_cluster(cpus: int) -> Iterator[None]:
         for attempt in range(1, _STARTS + 1):
             try:
                 ray.init(
-                    address="local", num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR,
-                    _node_ip_address=_LOOPBACK, _temp_dir=folder,
+                    address="local", num_cpus=cpus, include_dashboard=False, log_to_driver=False,
+                    logging_level=logging.ERROR, _node_ip_address=_LOOPBACK, _temp_dir=folder,
                 )  # fmt: skip
                 break
             except Exception as error:  # what Ray raises when a busy machine takes more than its 30 s is a plain one
