@@ -62,7 +62,7 @@ def study_and_show(
     print(f"{result.folder.path}: {told}; results.json, results.csv, summary.png")
     again = f"go on with: imagine study {file} --resume"
     if result.stopped:
-        raise WorkError(f"the study was stopped; {again}")
+        raise WorkError(f"{result.stopped}; {again}")
     if counts["failed"]:
         first = next(row for row in data["trials"] if row["status"] == "failed")
         raise WorkError(f"{counts['failed']} trials failed, such as {first['trial']}: {first['error']}; {again}")
@@ -110,7 +110,8 @@ def _show(data: dict[str, Any]) -> None:
     for name in METRICS:
         table.add_column(name, justify="right")
     for row in data["conditions"][:_MOST_ROWS]:
-        table.add_row(escape(row["condition"]), f"{row['ended']}/{row['trials']}", *(_cell(row, n) for n in METRICS))
+        ended = f"{row['ended']}/{row['trials']}" + (f", {row['pruned']} early" if row["pruned"] else "")
+        table.add_row(escape(row["condition"]), ended, *(_cell(row, name) for name in METRICS))
     if len(data["conditions"]) > _MOST_ROWS:
         table.caption = f"and {len(data['conditions']) - _MOST_ROWS} more in results.json"
     Console().print(table)

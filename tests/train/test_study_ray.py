@@ -3,6 +3,7 @@
 import os
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -28,7 +29,8 @@ pytestmark = pytest.mark.timeout(900)  # processes start slowly where other work
 
 TINY = (
     "env.worlds=2", "env.episode_ticks=40", "env.observation.view_cells=16", "env.observation.lidar_sectors=16",
-    "imitation.agent_steps=128", "ppo.agent_steps=512", "run.checkpoint_every_s=0.001",
+    'env.levels=["0"]', "imitation.agent_steps=128", "ppo.agent_steps=256", "run.checkpoint_every_s=0.001",
+    "run.final_episodes=1",
 )  # fmt: skip
 
 
@@ -111,7 +113,8 @@ def test_all_eight_results_are_there(story):
     data = study_data(story["study"], story["done"])
     assert [row["status"] for row in data["trials"]] == ["finished"] * 8
     assert data["finished"]
-    assert all(row["agent_steps"] == 640 for row in data["trials"])
+    assert all(row["agent_steps"] == 384 for row in data["trials"])
+    assert all(row["source"] == "evaluation" for row in data["trials"])
     assert all(0.0 < row["coverage"] <= 1.0 for row in data["trials"])
     assert [row["trials"] for row in data["conditions"]] == [2] * 4
 
@@ -130,18 +133,19 @@ def test_the_killed_worker_s_trial_was_resumed_by_another_and_not_restarted(stor
     ]
     by_second = [steps for pid, steps in reports if pid == after.pid]
     assert min(by_second) > after.resumed_from  # it did not do again what the checkpoint held
-    assert max(by_second) == 640
+    assert max(by_second) == 384
     steps = [row["agent_steps"] for row in read_metrics(run)]
     assert steps == sorted(set(steps))
     assert steps[0] <= after.resumed_from  # the first worker's metrics are kept
-    assert steps[-1] == 640
+    assert steps[-1] == 384
     weights = load_checkpoint(run).actor
     assert all(np.isfinite(value.numpy()).all() for value in weights.values())
 
 
 def test_an_interrupted_study_keeps_what_ended_and_goes_on_with_the_rest(story):
     stopped = story["stopped"]
-    assert stopped.stopped
+    assert stopped.stopped == "the study was stopped"
+    assert story["done"].stopped == ""
     kept = [name for name, outcome in stopped.outcomes.items() if outcome is not None]
     assert 1 <= len(kept) < 8
     assert all(stopped.outcomes[name].status == "finished" for name in kept)
@@ -212,6 +216,52 @@ def test_a_dry_run_shows_the_trials_and_starts_none(tiny_file, capsys, monkeypat
     assert status == 0
     assert "tiny: 2 trials" in said.out
     assert not (tiny_file.parent / "runs").exists()
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory):
+    """A search by ASHA of good trials, of bad ones that see next to nothing, and of one that diverges."""
+    study = StudySettings(
+        name="search", root=str(tmp_path_factory.mktemp("runs")), base="smoke", search="asha",
+        set=(*TINY, 'env.levels=["1"]', "ppo.agent_steps=384", "env.drones=3"),
+        variants=[
+            {"name": "wide"}, {"name": "wide-too", "set": ["ppo.gamma=0.9"]},
+            {"name": "blind", "set": ["env.map.range_cap_m=0.6"]}, {"name": "sick", "set": ["imitation.lr=1e30"]},
+        ],
+        asha={"grace_agent_steps": 192, "reduction_factor": 2},
+    )  # fmt: skip
+    result = run_study(study, cpus=1)
+    return {row["parameters"]["variant"]: row for row in study_data(study, result)["trials"]}, study, result
+
+
+def test_asha_stops_what_is_worse_and_evaluates_what_came_to_its_end(searched):
+    rows = searched[0]
+    assert (rows["wide"]["status"], rows["wide"]["source"], rows["wide"]["agent_steps"]) == (
+        "finished",
+        "evaluation",
+        576,
+    )
+    assert rows["blind"]["status"] == "pruned"
+    assert rows["blind"]["agent_steps"] < 576
+    ranked = [row["parameters"]["variant"] for row in study_data(searched[1], searched[2])["conditions"]]
+    assert ranked[-2:] == ["blind", "sick"]
+
+
+def test_a_trial_that_diverges_has_failed_and_says_why(searched):
+    row = searched[0]["sick"]
+    assert row["status"] == "failed"
+    assert row["error"].startswith("imitation diverged")
+    assert row["workers"] == 1  # a second try would diverge as well
+
+
+def test_a_watchdog_kills_a_process_that_hangs(tmp_path):
+    code = (
+        "import sys, threading; from pathlib import Path; from imagine.train.study.trial import Watchdog\n"
+        "with Watchdog(0.2, Path(sys.argv[1])): threading.Event().wait(60)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "error.txt")], timeout=120, check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert "nothing was reported for 0.2 s" in (tmp_path / "error.txt").read_text()
 
 
 def test_a_watchdog_that_is_fed_does_nothing_and_ends(tmp_path):

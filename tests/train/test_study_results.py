@@ -40,7 +40,7 @@ def data(tmp_path):
     folder = StudyFolder(study)
     log_attempt(folder.run(trials[0].name), 0)
     log_attempt(folder.run(trials[0].name), 640)
-    return study_data(study, StudyResult(folder, trials, outcomes, stopped=False))
+    return study_data(study, StudyResult(folder, trials, outcomes, stopped=""))
 
 
 def test_conditions_are_ranked_by_the_metric_with_intervals_over_repeats(data):

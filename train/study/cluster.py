@@ -24,6 +24,7 @@ _ENVIRONMENT = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # Ray's coming default, which it asks to be chosen
     "RAY_AIR_NEW_OUTPUT": "0",  # the command prints, not Tune
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",  # run folders hold metrics already
+    "TUNE_DISABLE_STRICT_METRIC_CHECKING": "1",  # a trial that fails before its first report has no metric
     "TUNE_FORCE_TRIAL_CLEANUP_S": "20",  # trials that do not stop by then are killed; by default it waits 10 minutes
 }
 

@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import _thread
+import logging
+import os
 import signal
 import threading
 import time
 
+from imagine.core.errors import WorkError
 from imagine.train.study.cluster import reachable
 from imagine.train.study.tune_events import Events
 
-_LOOK_EVERY_S = 5.0
-_GIVE_UP_S = 20.0
+logger = logging.getLogger(__name__)
+
+_LOOK_EVERY_S = 3.0
+_GIVE_UP_S = 15.0
+_END_S = 10.0
 _SPARE_S = 300.0  # beside the trials' own watchdogs, for workers to start anew
 
 
 class LostCluster:
     """While entered, interrupts the main thread when the head stops answering or nothing happens any more.
 
-    `reason` then says which, and is empty otherwise. Does nothing when entered outside the main thread, where Tune
-    could not be interrupted.
+    `reason` then says which, and is empty otherwise. Where even that does not end Tune, since it waits inside Ray for a
+    head that is gone, the process ends: Ray would end it too, half a minute later and without a word of what to do, and
+    nothing is lost, for a study goes on from its run folders. Does nothing when entered outside the main thread, where
+    Tune could not be interrupted.
     """
 
     def __init__(self, address: str | None, events: Events, silent_s: float) -> None:
@@ -54,4 +62,7 @@ class LostCluster:
                 self.reason = f"nothing happened to any trial for {self._silent_s:.0f} s"
             if self.reason:
                 _thread.interrupt_main(signal.SIGINT)
+                if not self._over.wait(_END_S):
+                    logger.critical("%s; go on with --resume", self.reason)
+                    os._exit(WorkError.exit_status)
                 return

@@ -62,8 +62,9 @@ def _bars(axes: Axes, metric: str, shown: list[dict[str, Any]], data: dict[str, 
         if interval is not None:
             axes.hlines(place, *interval, color=_DOT, lw=1.3)
             axes.vlines(interval, place - 0.16, place + 0.16, color=_DOT, lw=1.3)
-    low, high = axes.get_xlim()
-    axes.set_xlim(min(0.0, low) if metric != "coverage" else 0.0, max(high, 1.0) if metric == "coverage" else high)
+    # An interval may reach beyond what there can be: there it is cut.
+    nothing = all(not row[metric] for row in shown)
+    axes.set_xlim(0.0, 1.02 if metric == "coverage" else 1.0 if nothing else axes.get_xlim()[1])
     axes.grid(True, axis="x", color="#e6e6e6", lw=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(axis="y", length=0)

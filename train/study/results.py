@@ -56,7 +56,10 @@ def trial_rows(result: StudyResult) -> list[dict[str, Any]]:
 
 
 def condition_rows(study: StudySettings, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return a row for each condition, the best by the study's metric first: means over repeats with intervals."""
+    """Return a row for each condition, the best by the study's metric first: means over repeats with intervals.
+
+    Conditions of which ASHA stopped a trial come after the others: what they reached early tells of no end.
+    """
     conditions = []
     for condition in dict.fromkeys(row["condition"] for row in rows):
         own = [row for row in rows if row["condition"] == condition]
@@ -65,6 +68,7 @@ def condition_rows(study: StudySettings, rows: Sequence[dict[str, Any]]) -> list
             "parameters": own[0]["parameters"],
             "trials": len(own),
             "ended": sum(row["status"] not in ("unfinished", "failed") for row in own),
+            "pruned": sum(row["status"] == "pruned" for row in own),
         }
         for name in METRICS:
             values = [row[name] for row in own if row[name] is not None]
@@ -72,7 +76,12 @@ def condition_rows(study: StudySettings, rows: Sequence[dict[str, Any]]) -> list
             summary[f"{name}_ci95"] = mean_interval(values)
         conditions.append(summary)
     sign = -1.0 if study.better == "max" else 1.0
-    return sorted(conditions, key=lambda row: math.inf if row[study.metric] is None else sign * row[study.metric])
+
+    def rank(row: dict[str, Any]) -> tuple[bool, bool, float]:
+        value = row[study.metric]
+        return value is None, row["pruned"] > 0, 0.0 if value is None else sign * value
+
+    return sorted(conditions, key=rank)
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from imagine.core.errors import InputError, WorkError
+from imagine.core.errors import InputError
 from imagine.train.study.cluster import ray_connection
 from imagine.train.study.events import Event, Tell
 from imagine.train.study.folder import StudyFolder
@@ -25,12 +25,12 @@ from imagine.train.study.trial import Task, outcome_of, run_trial
 
 @dataclass(frozen=True)
 class StudyResult:
-    """How a study ended: outcomes by trial, None for those that have not ended; `stopped` by a signal."""
+    """How a study ended: outcomes by trial, None for those that have not ended; `stopped` says why, or is empty."""
 
     folder: StudyFolder
     trials: list[Trial]
     outcomes: dict[str, Outcome | None]
-    stopped: bool
+    stopped: str
 
 
 def run_study(
@@ -44,7 +44,7 @@ def run_study(
 
     With `resume` trials that ended are kept, and the others go on from their latest checkpoints. `tell` hears, in this
     thread, what happens to which trial. SIGINT and SIGTERM end the study so that it can be resumed. Raises InputError
-    for settings, folders and addresses that are wrong, before any trial starts; WorkError where the cluster is lost.
+    for settings, folders and addresses that are wrong, before any trial starts; WorkError where Ray does not start.
     """
     trials = plan_trials(study)
     folder = StudyFolder(study)
@@ -55,7 +55,7 @@ def run_study(
             folder.check_new()
         left = [trial for trial in trials if not _ended(folder, trial)]
         again = trials if study.search == "asha" else left  # ASHA compares with those that ended, too
-        stopped = False
+        stopped = ""
         with ray_connection(address, cpus) if left else contextlib.nullcontext():
             if left:
                 _check_room(study, left)
@@ -72,21 +72,23 @@ def _ended(folder: StudyFolder, trial: Trial) -> bool:
     return outcome is not None and outcome.ended
 
 
-def _fit(study: StudySettings, folder: StudyFolder, trials: Sequence[Trial], address: str | None, tell: Tell) -> bool:
-    """Let Tune run the trials; return whether a signal stopped it."""
+def _fit(study: StudySettings, folder: StudyFolder, trials: Sequence[Trial], address: str | None, tell: Tell) -> str:
+    """Let Tune run the trials; return why it stopped before all had ended, empty where it did not."""
     from ray import tune
 
+    from imagine.train.study.asha import Asha
     from imagine.train.study.lost_cluster import LostCluster
     from imagine.train.study.tune_events import Events
 
     tasks = [asdict(_task(study, folder, trial)) for trial in trials]
     bundles = {trial.name: _bundles(study, trial) for trial in trials}
+    asha = Asha(study, {t.name: total_steps(t.settings) for t in trials}) if study.search == "asha" else None
     events = Events(tell, lambda name, error: _close(folder, name, error))
     tuner = tune.Tuner(
         tune.with_resources(run_trial, lambda config: tune.PlacementGroupFactory(bundles[config["task"]["name"]])),
         param_space={"task": tune.grid_search(tasks)},
         tune_config=tune.TuneConfig(
-            scheduler=_scheduler(study, trials),
+            scheduler=asha,
             max_concurrent_trials=study.max_concurrent,
             trial_name_creator=_name,
             trial_dirname_creator=_name,
@@ -105,10 +107,16 @@ def _fit(study: StudySettings, folder: StudyFolder, trials: Sequence[Trial], add
         try:
             tuner.fit()
         except tune.TuneError as error:
-            raise WorkError(f"the study broke off: {error}; go on with --resume") from error
-    if watch.reason:
-        raise WorkError(f"{watch.reason}; go on with --resume")
-    return any(folder.outcome(trial.name) is None for trial in trials)
+            logging.getLogger(__name__).info("Tune broke off", exc_info=error)
+            return f"Tune broke off: {_last_line(error)}"
+    unfinished = any(folder.outcome(trial.name) is None for trial in trials)
+    return watch.reason or ("the study was stopped" if unfinished else "")
+
+
+def _last_line(error: object) -> str:
+    """Return what an error says, without the traceback that Ray puts before it."""
+    lines = str(error).strip().splitlines()
+    return lines[-1][:300] if lines else "it does not say why"
 
 
 def _name(trial: Any) -> str:
@@ -151,25 +159,6 @@ def _check_room(study: StudySettings, trials: Sequence[Trial]) -> None:
                     f"study {study.name}: a trial takes {wanted:g} {kind}s, the cluster has {there.get(kind, 0.0):g}; "
                     "lower resources, or give it a larger cluster"
                 )
-
-
-def _scheduler(study: StudySettings, trials: Sequence[Trial]) -> Any:
-    """Return Tune's scheduler: every trial to its end, or successive halving."""
-    from ray.tune.schedulers import ASHAScheduler, FIFOScheduler
-
-    if study.search != "asha":
-        return FIFOScheduler()  # type: ignore[no-untyped-call]
-    longest = max(total_steps(trial.settings) for trial in trials)
-    grace = min(study.asha.grace_agent_steps, longest)
-    return ASHAScheduler(
-        time_attr="agent_steps",
-        metric=study.metric,
-        mode=study.better,
-        grace_period=grace,
-        reduction_factor=study.asha.reduction_factor,
-        # Tune stops a trial that reports max_t; here trials end by themselves, after their evaluation.
-        max_t=int(longest * max(2.0, study.asha.reduction_factor)),
-    )
 
 
 def _close(folder: StudyFolder, name: str, error: str | None) -> None:

@@ -117,11 +117,12 @@ def outcome_of(folder: Path, status: Any, error: str = "") -> Outcome:
     rows = read_metrics(folder)
     last: Mapping[str, Any] = rows[-1] if rows else {}
     evaluated = _evaluated(folder) if status == "finished" else {}
+    trained = next((row["levels"] for row in reversed(rows) if row.get("levels")), {})
     return Outcome(
         status=status,
         agent_steps=int(last.get("agent_steps", 0)),
         wall_s=float(last.get("wall_s", 0.0)),
-        levels=evaluated or dict(last.get("levels", {})),
+        levels=evaluated or trained,
         source="evaluation" if evaluated else "training",
         error=error,
     )

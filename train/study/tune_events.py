@@ -6,15 +6,18 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from ray.tune import Callback
+from ray.tune.progress_reporter import TrialProgressCallback
 
 from imagine.train.study.events import Event, Kind, Tell
 
 _NUMBERS: tuple[str, ...] = ("agent_steps", "coverage", "t90", "contacts")
 
 
-class Events(Callback):
-    """Hears Tune's calls and passes them on; `close(trial, error)` is called when Tune has ended one."""
+class Events(TrialProgressCallback):
+    """Hears Tune's calls and passes them on; `close(trial, error)` is called when Tune has ended one.
+
+    It stands in for the callback of this class that Tune would add by itself, and that prints.
+    """
 
     def __init__(self, tell: Tell, close: Callable[[str, str | None], None]) -> None:
         self._tell, self._close = tell, close
