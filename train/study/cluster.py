@@ -22,6 +22,7 @@ _STARTS = 3
 _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # Ray's coming default, which it asks to be chosen
+    "RAY_worker_niceness": "0",  # by default 15, and trials starve beside anything else; nice the command instead
     "RAY_AIR_NEW_OUTPUT": "0",  # the command prints, not Tune
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",  # run folders hold metrics already
     "TUNE_DISABLE_STRICT_METRIC_CHECKING": "1",  # a trial that fails before its first report has no metric
@@ -76,6 +77,7 @@ def _own_cluster(cpus: int) -> Iterator[None]:
                 if attempt == _STARTS:
                     raise WorkError(f"Ray does not start here: {error}") from error
         try:
+            _keep_off_the_terminal()
             yield
         finally:
             ray.shutdown()
@@ -91,9 +93,17 @@ def _cluster_at(address: str) -> Iterator[None]:
     except (OSError, RuntimeError, ValueError) as error:
         raise InputError(f"--address {address}: Ray cannot join this cluster from here: {error}") from error
     try:
+        _keep_off_the_terminal()
         yield
     finally:
         ray.shutdown()
+
+
+def _keep_off_the_terminal() -> None:
+    """Take away what prints the raylets' remarks on standard output, whatever log_to_driver says."""
+    from ray._private.ray_logging import global_worker_stdstream_dispatcher
+
+    global_worker_stdstream_dispatcher.remove_handler("ray_print_logs")
 
 
 def check_address(address: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -117,7 +118,7 @@ def outcome_of(folder: Path, status: Any, error: str = "") -> Outcome:
     rows = read_metrics(folder)
     last: Mapping[str, Any] = rows[-1] if rows else {}
     evaluated = _evaluated(folder) if status == "finished" else {}
-    trained = next((row["levels"] for row in reversed(rows) if row.get("levels")), {})
+    trained: dict[str, dict[str, float]] = next((row["levels"] for row in reversed(rows) if row.get("levels")), {})
     return Outcome(
         status=status,
         agent_steps=int(last.get("agent_steps", 0)),
@@ -173,7 +174,8 @@ class _TuneReporter:
         if self.watchdog is not None:
             self.watchdog.feed()
         means = {name: mean_over_levels(levels, name) for name in ("coverage", "t90", "contacts")}
-        tune.report({"agent_steps": agent_steps, "train_s": wall_s, **means})
+        known = {name: value for name, value in means.items() if not math.isnan(value)}  # ASHA passes over the rest
+        tune.report({"agent_steps": agent_steps, "train_s": wall_s, **known})
 
 
 class Watchdog:
