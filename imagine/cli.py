@@ -265,24 +265,42 @@ def study(
 
 @app.command()
 def evaluate(
-    policy: Annotated[str, typer.Option(help="ONNX file, checkpoint, run folder, 'frontier' or 'random'")] = "",
-    levels: Annotated[str, typer.Option(help="such as 4, 0-6 or 1,3,5, or YAML files")] = "0-6",
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="ONNX file, checkpoint, run folder or baseline (random, frontier, …); may be given many times"
+        ),
+    ] = None,
+    against: Annotated[
+        str | None, typer.Option(metavar="POLICY", help="whom the others are compared with, episode by episode")
+    ] = None,
+    levels: Annotated[str, typer.Option(help="such as 4, 0-6 or 1,3,5; files, folders, or patterns of files")] = "0-6",
+    max_area: Annotated[float | None, typer.Option(metavar="M2", help="only levels with so much free space")] = None,
     drones: Annotated[str, typer.Option(help="such as 3 or 1,2,3")] = "3",
-    protocol: Annotated[str, typer.Option(help="off, one-hop or multi-hop")] = "one-hop",
-    episodes: Annotated[int, typer.Option(min=1)] = 20,
+    protocol: Annotated[str, typer.Option(help="off, one-hop or multi-hop, or several")] = "one-hop",
+    launch: Annotated[str, typer.Option(help="point: the level's own; random: anywhere, level mirrored")] = "point",
+    episodes: Annotated[int, typer.Option(min=1, help="on each level, with each team and protocol")] = 20,
     seed: Annotated[int, typer.Option(min=0)] = 0,
+    plots: Annotated[Path | None, typer.Option(metavar="FOLDER", help="draw curves, times and a radar here")] = None,
     film: Annotated[Path | None, typer.Option(metavar="FILE.gif|FILE.mp4", help="film the first episode")] = None,
     json_file: JsonFile = None,
+    episodes_file: Annotated[
+        Path | None, typer.Option("--episodes-json", metavar="FILE", help="write every episode here, one a line")
+    ] = None,
     overrides: Overrides = None,
 ) -> None:
-    """Measure a policy in the batched twin: coverage, time to 90%, contacts, bytes."""
+    """Measure and compare policies in the batched twin: coverage, time to 90%, contacts, bytes."""
     _needs("torch", "train")
     check_outputs(json_file, film_file=film)
-    from imagine.evaluate_command import evaluate_and_show
+    from imagine.evaluate_command import EvaluateOptions, evaluate_and_show
 
     evaluate_and_show(
-        policy, levels, drones, _protocol(protocol), episodes, seed, json_file, film, tuple(overrides or ())
-    )
+        EvaluateOptions(
+            policies=tuple(policy or ()), against=against, levels=levels, max_area_m2=max_area, drones=drones,
+            protocol=protocol, launch=launch, episodes=episodes, seed=seed, json_file=json_file,
+            episodes_file=episodes_file, plots=plots, film_file=film, overrides=tuple(overrides or ()),
+        )
+    )  # fmt: skip
 
 
 @export_app.command("onnx")

@@ -1,126 +1,149 @@
-"""What `imagine evaluate` reads from its flags, and the table it shows."""
+"""`imagine evaluate`: from its flags to the table, the files and the pictures."""
 
 from __future__ import annotations
 
-import functools
+import contextlib
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
 
-from imagine.core.errors import InputError
+from imagine.core.errors import InputError, WorkError
+from imagine.evaluate_lists import level_list, policy_list, protocol_list, team_sizes, within_area
+from imagine.evaluate_table import table_of, title_of
 from imagine.kernel_cache import announce_compiling
-from imagine.mesh_comm.settings import Protocol
 from imagine.onboard.settings import DEFAULT_POLICY
-from imagine.outputs import write_json
+from imagine.outputs import check_outputs
 from imagine.sim.film import Film
-from imagine.train.atomic_file import write_atomically
-from imagine.train.evaluation import evaluate, named_policy
-from imagine.train.evaluation_env import evaluation_env
-
-_HOUSES = "house:"
-_MOST_LEVELS = 1000
-_SHOWN = {
-    "level": "level", "drones": "drones", "coverage_mean": "seen", "t90_mean": "T90", "t90_reached": "T90\nreached",
-    "t95_mean": "T95", "t99_mean": "T99", "collisions_per_episode": "contacts", "path_m": "path,\nm",
-    "bytes_per_drone": "bytes\na drone", "link_share": "linked", "productivity_ratio": "most /\nleast",
-}  # fmt: skip
-"""Keys of a row that the table shows, and how it names them."""
+from imagine.stop_signals import StopSignals
+from imagine.train.atomic_file import write_atomically, write_failure
+from imagine.train.evaluation.comparison import Comparison, Flight, Progress
+from imagine.train.evaluation.contenders import distinct, named_contender, reference_of
+from imagine.train.evaluation.env import shared_envs
+from imagine.train.evaluation.plan import Launch, Plan
 
 
-def evaluate_and_show(
-    policy: str,
-    levels: str,
-    drones: str,
-    protocol: Protocol,
-    episodes: int,
-    seed: int,
-    json_file: Path | None,
-    film_file: Path | None = None,
-    overrides: Sequence[str] = (),
-) -> None:
-    """Measure a policy (empty: the shipped one), print a row per level and team size, film the first episode.
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """What the flags say, lists still as they were given; no `policies` is the shipped one."""
 
-    `overrides` change the environment, see `evaluation_env`.
-    Raises WorkError where the film cannot be written in the end; see `outputs.check_outputs` for before.
+    policies: Sequence[str] = ()
+    against: str | None = None
+    levels: str = "0-6"
+    max_area_m2: float | None = None
+    drones: str = "3"
+    protocol: str = "one-hop"
+    launch: str = "point"
+    episodes: int = 20
+    seed: int = 0
+    json_file: Path | None = None
+    episodes_file: Path | None = None
+    plots: Path | None = None
+    film_file: Path | None = None
+    overrides: Sequence[str] = ()
+
+
+def evaluate_and_show(options: EvaluateOptions) -> None:
+    """Fly every policy over the same episodes; show a row each, write what is wanted, row by row as they come.
+
+    Raises InputError before anything is flown where a flag is wrong; WorkError where a file cannot be written in the
+    end, or the work was interrupted: then all finished rows have been shown and written.
     """
-    chosen_levels, sizes = level_list(levels), team_sizes(drones)
-    chosen = named_policy(policy or str(DEFAULT_POLICY))
-    env = evaluation_env(chosen, overrides)
-    film = None if film_file is None else Film()
-    rows = evaluate(
-        chosen, chosen_levels, sizes, protocol, episodes, seed,
-        env, _tell, film,
-    )  # fmt: skip
-    title = ", ".join([policy or "shipped policy", protocol, f"{episodes} episodes each", *overrides])
-    table = Table(title=escape(title), box=None, padding=(0, 1, 0, 0))  # so that it fits into 80 columns
-    for heading in _SHOWN.values():
-        table.add_column(heading, justify="right")
-    for row in rows:
-        table.add_row(*(_cell(row[name]) for name in _SHOWN))
-    Console().print(table)
-    write_json(json_file, rows)
-    if film is not None and film_file is not None:
-        encoded = film.encode(film_file.suffix)
-        write_atomically(film_file, lambda temporary: temporary.write_bytes(encoded))
-        print(f"{film_file}: {len(film)} pictures, {len(encoded) / 1e6:.2f} MB", file=sys.stderr)
+    _check_files(options)
+    comparison = _comparison(options)
+    film = None if options.film_file is None else Film()
+    try:
+        with StopSignals(), _progress(comparison) as progress:
+            for flight in comparison.fly(progress, film):
+                _write_rows(options.json_file, comparison)
+                _append_episodes(options.episodes_file, comparison, flight)
+    except KeyboardInterrupt as error:
+        done = len(comparison.flown)
+        kept = f", kept in {options.json_file}" if done and options.json_file is not None else ""
+        raise WorkError(f"evaluate: interrupted; {done} of {comparison.flights} rows were done{kept}") from error
+    finally:
+        if comparison.rows:
+            Console().print(table_of(comparison.rows, title_of(comparison.rows, options.launch, options.overrides)))
+    if options.plots is not None:
+        from imagine.train.evaluation.plots import write_plots
+
+        for path in write_plots(comparison, options.plots):
+            _say(f"{path}")
+    if film is not None and options.film_file is not None:
+        encoded = film.encode(options.film_file.suffix)
+        write_atomically(options.film_file, lambda temporary: temporary.write_bytes(encoded))
+        _say(f"{options.film_file}: {len(film)} pictures, {len(encoded) / 1e6:.2f} MB")
 
 
-def _tell(text: str) -> None:
-    _announce()  # not before: a wrong level is refused in one line
-    _say(text)
+def _comparison(options: EvaluateOptions) -> Comparison:
+    """Return what the flags ask for, ready to fly. Raises InputError."""
+    if options.launch not in ("point", "random"):
+        raise InputError(f"--launch {options.launch}: expected point or random")
+    launch: Launch = "point" if options.launch == "point" else "random"
+    if options.max_area_m2 is not None and not options.max_area_m2 > 0.0:
+        raise InputError(f"--max-area {options.max_area_m2:g}: give square metres, more than 0")
+    levels, sizes, protocols = level_list(options.levels), team_sizes(options.drones), protocol_list(options.protocol)
+    given = policy_list(options.policies) or [str(DEFAULT_POLICY)]
+    named = distinct([named_contender(name, options.seed) for name in given])
+    contenders, reference = reference_of(named, options.against, options.seed)
+    envs = shared_envs(contenders, options.overrides)
+    kept = within_area(levels, options.max_area_m2)
+    plan = Plan(tuple(kept), tuple(sizes), tuple(protocols), options.episodes, options.seed, launch)
+    comparison = Comparison(contenders, envs, plan, reference)
+    if options.max_area_m2 is not None:  # not before: what is refused is refused in one line
+        _say(f"{len(kept)} of {len(levels)} levels have at most {options.max_area_m2:g} m² of free space")
+    return comparison
 
 
-@functools.cache
-def _announce() -> None:
+def _check_files(options: EvaluateOptions) -> None:
+    """Raise InputError naming a file or folder that cannot be written, or lacks what draws it."""
+    check_outputs(options.json_file, film_file=options.film_file)
+    check_outputs(options.episodes_file)
+    if options.episodes_file is not None and options.episodes_file == options.json_file:
+        raise InputError("--episodes-json and --json are the same file: give two")
+    if options.plots is not None:
+        from imagine.train.evaluation.plots import check_plots
+
+        check_plots(options.plots)
+
+
+@contextlib.contextmanager
+def _progress(comparison: Comparison) -> Iterator[Progress]:
+    """Tell how far it is: by a bar on a terminal, else by a line for each row that begins."""
     announce_compiling(_say)
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield Progress(begins=_say)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bar(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("episodes", total=comparison.flights * comparison.plan.episodes)
+        yield Progress(lambda text: bar.update(task, description=text), lambda ended: bar.advance(task, ended))
+
+
+def _write_rows(path: Path | None, comparison: Comparison) -> None:
+    """Write all rows so far anew, so that the file is whole whatever happens next."""
+    if path is not None:
+        text = json.dumps(comparison.rows, indent=1) + "\n"
+        write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def _append_episodes(path: Path | None, comparison: Comparison, flight: Flight) -> None:
+    """Add a flight's episodes, one JSON object a line; the first flight begins the file anew."""
+    if path is None:
+        return
+    lines = "".join(json.dumps(told) + "\n" for told in comparison.records(flight))
+    try:
+        with path.open("w" if len(comparison.flown) == 1 else "a", encoding="utf-8") as file:
+            file.write(lines)
+    except OSError as error:
+        raise write_failure(path, error) from error
 
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr)
-
-
-def _cell(value: object) -> str:
-    """Return a number with three figures, thousands in full."""
-    if isinstance(value, float):
-        return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
-    return str(value)
-
-
-def level_list(text: str) -> list[str]:
-    """Return the levels of a list such as 4, 0-6 or 1,3,house.yaml; house:0-9 and house:0-9:120 are ten houses each.
-
-    Raises InputError on an empty range, and where a name is missing.
-    """
-    levels: list[str] = []
-    for part in (part.strip() for part in text.split(",")):
-        if not part:
-            raise InputError(f"--levels {text!r}: a level is missing: give such as 4, 0-6 or 1,3,house.yaml")
-        prefix, seeds, area = "", part, ""
-        if part.startswith(_HOUSES):
-            prefix, (seeds, colon, size) = _HOUSES, part.removeprefix(_HOUSES).partition(":")
-            area = colon + size
-        first, dash, last = seeds.partition("-")
-        if dash and first.isdecimal() and last.isdecimal():
-            if int(last) < int(first):
-                raise InputError(f"--levels {part}: the range is empty; write {prefix}{last}-{first}{area}")
-            if int(last) - int(first) >= _MOST_LEVELS:
-                raise InputError(f"--levels {part}: more than {_MOST_LEVELS} levels; take a shorter range")
-            levels += [f"{prefix}{number}{area}" for number in range(int(first), int(last) + 1)]
-        else:
-            levels.append(part)
-    return levels
-
-
-def team_sizes(text: str) -> list[int]:
-    """Return the numbers of a list such as 3 or 1,2,3. Raises InputError past 1 to 16."""
-    try:
-        numbers = [int(part) for part in text.split(",")]
-    except ValueError as error:
-        raise InputError(f"--drones {text}: expected whole numbers such as 3 or 1,2,3") from error
-    if not all(1 <= number <= 16 for number in numbers):
-        raise InputError(f"--drones {text}: from 1 to 16 drones")
-    return numbers

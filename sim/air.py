@@ -21,8 +21,8 @@ from imagine.core.errors import InputError
 from imagine.core.lidar import LidarSpec
 from imagine.core.raster import CELL, TILE
 from imagine.mesh_comm.settings import MeshSettings
-from imagine.sim.propagation import Propagation
 from imagine.sim.radio import RadioSettings
+from imagine.sim.randomisation import draw
 
 SCAN, TILES, DIGEST, STATUS = 0, 1, 2, 3
 """Kinds of messages, in the order of `bytes_sent`."""
@@ -81,8 +81,12 @@ TILE_NOTE = _record(
 what a version costs in bytes, and whether scans were drawn on it ahead."""
 
 
+BUDGET, LOSS, CLEAR_M, WALLED_M, BUDGET_DB, EXPONENT, WALL_DB = range(7)
+"""Columns of `media`: bytes a second that a drone may send, chance of loss, and the fields of Propagation."""
+
+
 class AirRules(NamedTuple):
-    """The settings as plain numbers: bytes, seconds, metres; rates per second."""
+    """The settings that are alike in all worlds, as plain numbers: bytes, seconds, metres; rates per second."""
 
     ticks_per_s: float
     shares: bool
@@ -96,15 +100,15 @@ class AirRules(NamedTuple):
     peer_timeout: float
     air_rate: float
     latency: float
-    loss: float
     queue_bytes: float
     range_min: float
     range_cap: float
-    propagation: Propagation
 
 
 class AirState(NamedTuple):
     """All arrays of the air, for kernels to take whole; `[worlds, drones, ...]`.
+
+    `media` `[worlds, 7]` are the radio's numbers that may differ, columns BUDGET to WALL_DB.
 
     For others to read: `reach` uint8 `[..., drones]`, who hears whom this tick; `links` LINK and `peers` PEER
     `[..., drones]`; `counters` int64 `[..., 11]`. The rest: `nodes` NODE; `messages` MESSAGE, a ring; slots of scans,
@@ -116,6 +120,7 @@ class AirState(NamedTuple):
     """
 
     rules: AirRules
+    media: NDArray[np.float64]
     reach: NDArray[np.uint8]
     links: NDArray[np.void]
     peers: NDArray[np.void]
@@ -152,20 +157,29 @@ class Air:
     ) -> None:
         """Make an air where nobody has said anything. `range_cap_m` and `lidar` describe the scans that are mapped.
 
-        Raises InputError on more drones than one status can tell of.
+        `mesh.rate_bytes_per_s` is the most that any world's drones may send. Raises InputError on more drones than one
+        status can tell of.
         """
         if not 1 <= drones <= MOST_DRONES:
             raise InputError(f"the air holds 1 to {MOST_DRONES} drones a world, got {drones}")
         self.rules = _rules(radio, mesh, lidar, range_cap_m, tick_s)
+        self._radio = radio
         self.state = _allocate(worlds, drones, tile_rows, tile_columns, self.rules)
         for world in range(worlds):
             self.clear(world)
 
-    def clear(self, world: int) -> None:
-        """Let everyone in a world forget everything, with nothing in flight."""
+    def clear(self, world: int, radio: RadioSettings | None = None, budget_bytes_per_s: float | None = None) -> None:
+        """Let everyone in a world forget everything, with nothing in flight.
+
+        Range and loss are from now on those of `radio`, of ranges the middle, and the bytes a second that a drone may
+        send `budget_bytes_per_s`; by default those that the air was made with.
+        """
         for name, array in self.state._asdict().items():
             if name != "rules":
                 array[world] = np.zeros((), array.dtype)  # a zero of any kind, records among them
+        medium = radio or self._radio
+        budget = self.rules.budget_rate if budget_bytes_per_s is None else budget_bytes_per_s
+        self.state.media[world] = (budget, draw(medium.loss, None), *medium.propagation)
         for never in ("heard_tick", "pose_tick", "status_tick", "digest_tick"):
             self.state.peers[world][never] = NEVER
         self.state.notes[world]["sent_tick"] = NEVER
@@ -215,11 +229,9 @@ def _rules(radio: RadioSettings, mesh: MeshSettings, lidar: LidarSpec, range_cap
         peer_timeout=mesh.peer_timeout_s,
         air_rate=radio.rate_bps / 8.0,
         latency=radio.latency_s,
-        loss=radio.loss,
         queue_bytes=float(radio.queue_bytes),
         range_min=lidar.range_min,
         range_cap=range_cap_m,
-        propagation=radio.propagation,
     )
 
 
@@ -238,6 +250,7 @@ def _allocate(worlds: int, drones: int, tile_rows: int, tile_columns: int, rules
     per_drone, per_peer = (worlds, drones), (worlds, drones, drones)
     return AirState(
         rules=rules,
+        media=np.zeros((worlds, 7)),
         reach=np.zeros(per_peer, np.uint8),
         links=np.zeros(per_peer, LINK),
         peers=np.zeros(per_peer, PEER),

@@ -10,9 +10,24 @@ import numba
 import numpy as np
 
 from imagine.core.raster import TILE
-from imagine.sim.air import DIGEST, OWN_SCAN, PEER_SCAN, PEER_TILE, SCAN, STATUS, TILES, UNIT_TILES
+from imagine.sim.air import (
+    BUDGET_DB,
+    CLEAR_M,
+    DIGEST,
+    EXPONENT,
+    LOSS,
+    OWN_SCAN,
+    PEER_SCAN,
+    PEER_TILE,
+    SCAN,
+    STATUS,
+    TILES,
+    UNIT_TILES,
+    WALL_DB,
+    WALLED_M,
+)
 from imagine.sim.air_tiles import claim, copy_tile, draw_marks
-from imagine.sim.propagation import fill_reach
+from imagine.sim.propagation import Propagation, fill_reach
 
 _EXTRAPOLATE_S = 1.0  # as in mesh_comm.peers
 
@@ -31,7 +46,13 @@ def deliver(air, world, tick, key, poses, alive, segments, layers, versions, dir
     rules = air.rules
     drones = layers.shape[0]
     reach, links, nodes, messages = air.reach[world], air.links[world], air.nodes[world], air.messages[world]
-    fill_reach(reach, poses, segments, rules.propagation)
+    media = air.media
+    loss = media[world, LOSS]
+    propagation = Propagation(
+        media[world, CLEAR_M], media[world, WALLED_M], media[world, BUDGET_DB], media[world, EXPONENT],
+        media[world, WALL_DB],
+    )  # fmt: skip
+    fill_reach(reach, poses, segments, propagation)
     for sender in range(drones):
         for receiver in range(drones):
             if not (alive[sender] and alive[receiver]):
@@ -55,7 +76,7 @@ def deliver(air, world, tick, key, poses, alive, segments, layers, versions, dir
             link = links[sender, receiver]
             if reach[sender, receiver] == 0:
                 link.out_of_range += 1
-            elif rules.loss > 0.0 and _chance(key, tick, sender, receiver, message.sequence) < rules.loss:
+            elif loss > 0.0 and _chance(key, tick, sender, receiver, message.sequence) < loss:
                 link.lost += 1
                 link.lost_bytes += message.size
             else:

@@ -13,6 +13,7 @@ from imagine.core.raster import TILE
 from imagine.mesh_comm.messages import MAX_DATAGRAM
 from imagine.mesh_comm.seal import OVERHEAD
 from imagine.sim.air import (
+    BUDGET,
     BYTES_SENT,
     DIGEST,
     MESSAGES_SENT,
@@ -84,7 +85,7 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
         if not alive[drone]:
             continue
         node = nodes[drone]
-        node.tokens = min(rules.burst, node.tokens + rules.budget_rate / rules.ticks_per_s)
+        node.tokens = min(rules.burst, node.tokens + air.media[world, BUDGET] / rules.ticks_per_s)
         live = 0  # a bit for each peer in touch
         for peer in range(layers.shape[0]):
             if is_live(peers[drone, peer], tick, rules):

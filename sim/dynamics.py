@@ -16,11 +16,12 @@ from typing import Annotated
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from imagine.core.config import Settings
 from imagine.core.vehicle_limits import VehicleLimits
 from imagine.sim.keyed_noise import key_of
+from imagine.sim.randomisation import Quantity, ends, within
 
 TICK_S = 0.1
 """Simulated time of one step: one LiDAR turn."""
@@ -30,47 +31,29 @@ LONGEST_DELAY_S = 1.0
 HISTORY = math.ceil(LONGEST_DELAY_S / TICK_S) + 2
 """Setpoints that are kept, one a tick: a delayed one may start within a substep."""
 
-Quantity = float | tuple[float, float]
-
-
-def _within(least: float, most: float) -> AfterValidator:
-    """Return a check that a number, or both ends of a range (low, high), lie within bounds."""
-
-    def check(value: Quantity) -> Quantity:
-        low, high = _ends(value)
-        if not (least <= low <= high <= most):
-            raise ValueError(f"give a number, or a range [low, high], within {least:g} and {most:g}")
-        return value
-
-    return AfterValidator(check)
-
-
-def _ends(value: Quantity) -> tuple[float, float]:
-    return value if isinstance(value, tuple) else (value, value)
-
 
 class DynamicsSettings(Settings):
     """How the airframe answers, SI units; a range [low, high] is drawn anew for every drone and episode."""
 
-    lag_s: Annotated[Quantity, _within(0.0, 2.0)] | None = Field(
+    lag_s: Annotated[Quantity, within(0.0, 2.0)] | None = Field(
         default=None, description="time constant from setpoint to velocity, s; left out: as the vehicle's limits say"
     )
-    acceleration_mps2: Annotated[Quantity, _within(0.1, 30.0)] | None = Field(
+    acceleration_mps2: Annotated[Quantity, within(0.1, 30.0)] | None = Field(
         default=None, description="greatest horizontal acceleration, m/s²; left out: as the vehicle's limits say"
     )
-    drag_per_s: Annotated[Quantity, _within(0.0, 5.0)] = Field(
+    drag_per_s: Annotated[Quantity, within(0.0, 5.0)] = Field(
         default=0.0, description="linear drag over mass: deceleration for each m/s through the air, 1/s"
     )
-    mass_kg: Annotated[Quantity, _within(0.01, 10.0)] = Field(
+    mass_kg: Annotated[Quantity, within(0.01, 10.0)] = Field(
         default=0.087, description="mass, kg, which counts where drones push each other and crates; DJI Tello"
     )
-    delay_s: Annotated[Quantity, _within(0.0, LONGEST_DELAY_S)] = Field(
+    delay_s: Annotated[Quantity, within(0.0, LONGEST_DELAY_S)] = Field(
         default=0.0, description="time from a setpoint to its effect, s"
     )
-    wind_mps: Annotated[Quantity, _within(0.0, 2.0)] = Field(
+    wind_mps: Annotated[Quantity, within(0.0, 2.0)] = Field(
         default=0.0, description="standard deviation of the drift along each axis, m/s (Ornstein-Uhlenbeck)"
     )
-    wind_correlation_s: Annotated[Quantity, _within(0.1, 600.0)] = Field(
+    wind_correlation_s: Annotated[Quantity, within(0.1, 600.0)] = Field(
         default=5.0, description="time over which the drift keeps its way, s"
     )
 
@@ -84,7 +67,7 @@ class DynamicsSettings(Settings):
             limits.acceleration_mps2 if self.acceleration_mps2 is None else self.acceleration_mps2,
             self.drag_per_s, self.mass_kg, self.delay_s, self.wind_mps, self.wind_correlation_s,
         )  # fmt: skip
-        low, high = np.array([_ends(field) for field in fields]).T
+        low, high = np.array([ends(field) for field in fields]).T
         dynamics = np.zeros((drones, COLUMNS))
         dynamics[:, : len(fields)] = low + (high - low) * rng.random((drones, len(fields)))
         lag, drag = dynamics[:, LAG], dynamics[:, DRAG]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,15 +21,18 @@ from imagine.core.raster import TILE
 from imagine.sim.action_values import action_values
 from imagine.sim.air import Air
 from imagine.sim.air_receive import claim_own
-from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, fill_critic
+from imagine.sim.critic_images import CRITIC_CELLS, CRITIC_CHANNELS, CriticImages
 from imagine.sim.decision_state import DecisionState
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.exploration_tick import FLYING, LAUNCHING, STAGES, WAITING, Specs, fly, locate, observe, scan, share
 from imagine.sim.keyed_noise import root_keys
-from imagine.sim.level import Level, load_level, mirrored
+from imagine.sim.level import Level
+from imagine.sim.level_names import expand_levels
+from imagine.sim.level_variants import LevelVariants, level_shares
 from imagine.sim.metrics import EpisodeMetrics, EpisodeTotals, Recorder
 from imagine.sim.odometry_drift import OdometryDrift
 from imagine.sim.planner_actions import plan_worlds
+from imagine.sim.randomisation import draw
 from imagine.sim.reward import rewards, survivors, sweep_cells
 from imagine.sim.team_maps import Scratch, TeamMaps, derive
 from imagine.sim.twin import TICK_S, Twin
@@ -96,11 +99,11 @@ class Exploration:
         self.lidar = settings.lidar_spec
         keys = list(range(worlds)) if world_keys is None else list(world_keys)
         _check_seeds(seed, keys, worlds)
-        self._variants = [_variants(load_level(name), settings.mirror) for name in settings.levels]
-        self._weights = _weights(settings)
+        names, shares = expand_levels(settings.levels, settings.level_weights)
+        self._variants = LevelVariants(names, settings.mirror)
+        self._weights = np.array(shares)
         self._generators = [np.random.default_rng([seed, key]) for key in keys]
-        grids = [level.grid for variants in self._variants for level in variants]
-        rows, columns = max(g[3] for g in grids), max(g[2] for g in grids)
+        rows, columns = self._variants.rows, self._variants.columns
         first = [self._draw_level(world) for world in range(worlds)]
         self.twin = Twin(first, drones, self.lidar, settings.limits, seed, settings.dynamics, keys, settings.sensing)
         workers = self.twin.workers
@@ -110,6 +113,7 @@ class Exploration:
             worlds, drones, rows // TILE, columns // TILE, settings.radio, settings.mesh, self.lidar, cap, TICK_S
         )
         self.decisions = DecisionState(worlds, drones, rows, columns, settings.observation, settings.action, workers)
+        self._critic = CriticImages(self.maps.arrays, workers)
         self._recorder = Recorder(worlds, drones, seed)
         self.ticks = np.zeros(worlds, np.int64)
         self._ended = np.zeros(worlds, bool)  # and not started anew
@@ -140,9 +144,21 @@ class Exploration:
         return self.twin.alive
 
     def _draw_level(self, world: int) -> Level:
-        generator = self._generators[world]
-        variants = self._variants[generator.choice(len(self._variants), p=self._weights)]
-        return variants[generator.integers(len(variants))]
+        return self._variants.get(*self._variants.draw(self._generators[world], self._weights))
+
+    @property
+    def level_weights(self) -> NDArray[np.float64]:
+        """The share of coming episodes of each level that `settings.levels` stand for, `[levels]`."""
+        return self._weights.copy()
+
+    def set_level_weights(self, weights: Sequence[float]) -> None:
+        """Draw the levels of all episodes that begin from now on by other weights, one for each level.
+
+        Ranges in `settings.levels` stand for many levels, see `sim/level_names.py`; they have a weight each here.
+        Episodes in progress go on where they are. Raises InputError where a weight is negative or missing, or all are
+        zero.
+        """
+        self._weights = level_shares(weights, len(self._variants))
 
     def reset(self) -> Observation:
         """Start a new episode in every world."""
@@ -161,7 +177,9 @@ class Exploration:
         self.twin.set_level(world, level, level.launch_poses(self.drones, generator))
         column0, row0, _, _ = level.grid
         self.maps.clear(world, level.coverable, (column0, row0))
-        self.air.clear(world)
+        self._critic.clear(world)
+        draws = self._generators[world]
+        self.air.clear(world, self.settings.radio.drawn(draws), draw(self.settings.budget_bytes_per_s, draws))
         self.decisions.clear(world)
         self.ticks[world] = 0
         self._ended[world] = False
@@ -323,14 +341,12 @@ class Exploration:
     def _observation(self) -> Observation:
         return Observation(self._observed[self._now], self)
 
-    def critic_images(self) -> NDArray[np.float32]:
-        """Return what a centralised critic sees of every drone's world, float32 `[worlds, drones, channels, n, n]`."""
-        critic = np.zeros((self.worlds, self.drones, CRITIC_CHANNELS, CRITIC_CELLS, CRITIC_CELLS), np.float32)
-        maps = self.maps
-        self.twin.workers.over(
-            self.worlds, fill_critic, critic, maps.seen, maps.coverable, maps.origins, self.twin.poses
-        )
-        return critic
+    def critic_images(self, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+        """Return what a centralised critic sees of every drone's world, float32 `[worlds, drones, channels, n, n]`.
+
+        With `out`, contiguous and of that shape or `[worlds * drones, channels, n, n]`, they are written there.
+        """
+        return self._critic.fill(self.twin.poses, out)
 
     def planner_actions(self) -> NDArray[np.float32]:
         """Return the frontier planner's action for every drone, nan where it is dead or sees no frontier to go to."""
@@ -372,23 +388,8 @@ def _specs(settings: ExplorationSettings, decisions: DecisionState) -> Specs:
     )
 
 
-def _variants(level: Level, mirror: bool) -> list[Level]:
-    if not mirror:
-        return [level]
-    flags = (False, True)
-    return [mirrored(level, swap, x, y) for swap in flags for x in flags for y in flags]
-
-
 def _check_seeds(seed: int, keys: Sequence[int], worlds: int) -> None:
     if seed < 0:
         raise InputError(f"seed is {seed}: give 0 or more")
     if len(keys) != worlds or min(keys) < 0:
         raise InputError(f"world_keys {keys}: give one for each of the {worlds} worlds, none negative")
-
-
-def _weights(settings: ExplorationSettings) -> NDArray[np.float64]:
-    given: Iterable[float] = settings.level_weights or (1.0,) * len(settings.levels)
-    weights = np.array(list(given), float)
-    if len(weights) != len(settings.levels) or (weights < 0).any() or weights.sum() <= 0:
-        raise InputError("level_weights: give one weight for each of levels, none negative, not all zero")
-    return np.asarray(weights / weights.sum())

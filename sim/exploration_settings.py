@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 from pydantic import Field, field_validator
 
 from imagine.core.config import Settings
 from imagine.core.contract import ActionSpec
+from imagine.core.errors import InputError
 from imagine.core.lidar import PRESETS, LidarSpec
 from imagine.core.mapping import MapSettings
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.vehicle_limits import VehicleLimits
 from imagine.mesh_comm.settings import MeshSettings, Protocol
 from imagine.sim.dynamics import DynamicsSettings
+from imagine.sim.level_names import expand_level
 from imagine.sim.lidar_model import LidarModel
 from imagine.sim.odometry_drift import DriftSettings
 from imagine.sim.radio import RadioSettings
+from imagine.sim.randomisation import Quantity, ends, positive
 from imagine.sim.reward import RewardSettings
 
 
 class ExplorationSettings(Settings):
     """What is explored, by whom, and what a policy sees and does."""
 
-    levels: tuple[str, ...] = Field(default=("0", "1", "2", "3", "4", "5", "6"), min_length=1)
-    level_weights: tuple[float, ...] | None = Field(default=None, description="share of episodes per level")
+    levels: tuple[str, ...] = Field(
+        default=("0", "1", "2", "3", "4", "5", "6"), min_length=1,
+        description="names of levels, also ranges: 0-6, house:0-99, house:0-99:50-200 (areas in m²)",
+    )  # fmt: skip
+    level_weights: tuple[float, ...] | None = Field(
+        default=None, description="share of episodes of each of levels; what a range stands for shares it equally"
+    )
     worlds: int = Field(default=24, ge=1, le=4096)
     drones: int = Field(default=3, ge=1, le=16)
     episode_ticks: int = Field(default=1000, ge=1)
@@ -41,14 +50,24 @@ class ExplorationSettings(Settings):
     observation: ObservationSpec = ObservationSpec()
     action: ActionSpec = ActionSpec()
     protocol: Protocol = "one-hop"
-    budget_bytes_per_s: float = Field(
-        default=MeshSettings().rate_bytes_per_s, gt=0.0, description="bytes a second that a drone may send, sealed"
+    budget_bytes_per_s: Annotated[Quantity, positive()] = Field(
+        default=MeshSettings().rate_bytes_per_s, description="bytes a second that a drone may send, sealed"
     )
     radio: RadioSettings = RadioSettings()
     reward: RewardSettings = RewardSettings()
     dynamics: DynamicsSettings = DynamicsSettings()
     sensing: LidarModel = LidarModel()
     drift: DriftSettings = DriftSettings()
+
+    @field_validator("levels")
+    @classmethod
+    def _known_ranges(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for name in names:
+            try:
+                expand_level(name, "level")
+            except InputError as error:
+                raise ValueError(str(error)) from error
+        return names
 
     @field_validator("lidar")
     @classmethod
@@ -65,5 +84,5 @@ class ExplorationSettings(Settings):
 
     @property
     def mesh(self) -> MeshSettings:
-        """How the drones use their radios."""
-        return MeshSettings(protocol=self.protocol, rate_bytes_per_s=self.budget_bytes_per_s)
+        """How the drones use their radios, with the largest budget that an episode may have."""
+        return MeshSettings(protocol=self.protocol, rate_bytes_per_s=ends(self.budget_bytes_per_s)[1])

@@ -75,10 +75,12 @@ def fly(first, last, modes, intents, setpoints, ranges, estimates, alive, specs,
 @numba.njit(cache=True, nogil=True)
 def locate(first, last, modes, estimates, poses, drift):  # type: ignore[no-untyped-def]
     """Carry what drones take their `poses` to be on by a tick; `drift` is `OdometryDrift.kernel_args()`."""
-    error, before, scale, drawn, ages, numbers, normal = drift
+    error, before, scale, drifts, drawn, ages, numbers, normal = drift
     for world in range(first, last):
         if modes[world] != WAITING:
-            advance_worlds(world, world + 1, estimates, poses, error, before, scale, drawn, ages, numbers, normal)
+            advance_worlds(
+                world, world + 1, estimates, poses, error, before, scale, drifts, drawn, ages, numbers, normal
+            )
 
 
 @numba.njit(cache=True, nogil=True)

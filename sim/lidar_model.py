@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from imagine.core.config import Settings
 from imagine.core.lidar import LidarSpec
 from imagine.sim.keyed_noise import LARGEST_DEVIATE, key_of, scramble
+from imagine.sim.randomisation import Quantity, draw, ends, positive, within
 
 _PATCH_M = 0.5
 _LOSSES, _PATCHES = 1, 2  # what keys are drawn for, besides the noise
@@ -21,30 +23,30 @@ STD, STD_PER_M, RANGE_MIN, RANGE_MAX, DROPOUT, DROPPED, MISSES, DARK_SHARE, DARK
 
 
 class LidarModel(Settings):
-    """How far a simulated LiDAR is from ideal. By default its only fault is the sensor's own range noise."""
+    """How far a simulated LiDAR is from ideal. By default its only fault is the sensor's own range noise.
 
-    noise_std_m: float | None = Field(default=None, ge=0.0, le=1.0, description="range noise; None: the sensor's own")
-    noise_per_m: float = Field(default=0.0, ge=0.0, le=0.1, description="what the noise grows by for each metre")
-    noise_scale: tuple[float, float] = Field(
-        default=(1.0, 1.0), description="all noise is scaled by a number drawn from here for every episode"
+    A range [low, high] is drawn from anew for every world and episode; all of a team's LiDARs are alike.
+    """
+
+    noise_std_m: Annotated[Quantity, within(0.0, 1.0)] | None = Field(
+        default=None, description="range noise, m; None: the sensor's own"
     )
-    dropout: tuple[float, float] = Field(
-        default=(0.0, 0.0), description="share of beams lost for no reason, drawn from here for every episode"
+    noise_per_m: Annotated[Quantity, within(0.0, 0.1)] = Field(
+        default=0.0, description="what the noise grows by for each metre"
     )
+    noise_scale: Annotated[Quantity, within(0.0, 10.0)] = Field(default=1.0, description="what all noise is scaled by")
+    dropout: Annotated[Quantity, within(0.0, 1.0)] = Field(default=0.0, description="share of beams lost for no reason")
     dropout_invalid: bool = Field(default=True, description="lost beams read invalid (nan), not no return (inf)")
-    miss_at_max: float = Field(
-        default=0.0, ge=0.0, le=1.0, description="share of beams without return at the greatest range; grows as r²"
+    miss_at_max: Annotated[Quantity, within(0.0, 1.0)] = Field(
+        default=0.0, description="share of beams without return at the greatest range; grows as r²"
     )
-    dark_share: float = Field(default=0.0, ge=0.0, le=1.0, description="share of 0.5 m patches of wall that are dark")
-    dark_range_m: float = Field(default=2.0, gt=0.0, description="dark patches give no return from further away")
+    dark_share: Annotated[Quantity, within(0.0, 1.0)] = Field(
+        default=0.0, description="share of 0.5 m patches of wall that are dark"
+    )
+    dark_range_m: Annotated[Quantity, positive()] = Field(
+        default=2.0, description="dark patches give no return from further away"
+    )
     skew: bool = Field(default=False, description="beams are taken one after another while the drone moves")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> LidarModel:
-        for name, (low, high), most in (("noise_scale", self.noise_scale, 10.0), ("dropout", self.dropout, 1.0)):
-            if not 0.0 <= low <= high <= most:
-                raise ValueError(f"{name}: give lowest and highest within 0 and {most:g}, lowest first")
-        return self
 
 
 def sensor_numbers(
@@ -52,18 +54,22 @@ def sensor_numbers(
 ) -> NDArray[np.float64]:
     """Return the numbers of one world's sensors for an episode, `[9]`, columns as named in this module.
 
-    What a model leaves open is drawn from the generator; without one it is the middle.
+    Ranges are drawn from by the generator; without one it is their middle.
     """
-    scale, dropout = ((low + high) / 2.0 for low, high in (model.noise_scale, model.dropout))
-    if generator is not None:
-        scale, dropout = generator.uniform(*model.noise_scale), generator.uniform(*model.dropout)
+    fields = (
+        model.noise_scale, model.dropout, spec.noise_std if model.noise_std_m is None else model.noise_std_m,
+        model.noise_per_m, model.miss_at_max, model.dark_share, model.dark_range_m,
+    )  # fmt: skip
+    # scale and dropout take a number each whether they are ranges or not, as they always have
+    always = None if generator is None else [generator.uniform(*ends(field)) for field in fields[:2]]
+    scale, dropout = always or [draw(field, None) for field in fields[:2]]
+    std, per_m, misses, dark_share, dark_range = (draw(field, generator) for field in fields[2:])
     row = np.empty(_ROW)
-    row[STD] = scale * (spec.noise_std if model.noise_std_m is None else model.noise_std_m)
-    row[STD_PER_M] = scale * model.noise_per_m
+    row[STD], row[STD_PER_M] = scale * std, scale * per_m
     row[RANGE_MIN], row[RANGE_MAX] = spec.range_min, spec.range_max
     row[DROPOUT], row[DROPPED] = dropout, math.nan if model.dropout_invalid else math.inf
-    row[MISSES] = model.miss_at_max / spec.range_max**2
-    row[DARK_SHARE], row[DARK_RANGE] = model.dark_share, model.dark_range_m
+    row[MISSES] = misses / spec.range_max**2
+    row[DARK_SHARE], row[DARK_RANGE] = dark_share, dark_range
     return row
 
 

@@ -29,6 +29,12 @@ class DriftSettings(Settings):
     """The model's constants; the defaults are fitted to flights with instantaneous scans, see docs/sensing.md."""
 
     enabled: bool = Field(default=False, description="give drones drifting poses; otherwise they know where they are")
+    share: float = Field(
+        default=1.0,
+        ge=0.0,
+        le=1.0,
+        description="share of episodes with drift, where enabled; in the others poses are exact",
+    )
     sigma_m: float = Field(default=0.051, ge=0.0, le=10.0, description="drift of x and of y, once levelled off")
     length_m: float = Field(default=100.0, gt=0.0, description="distance over which drift of x and y is forgotten")
     sigma_rad: float = Field(default=0.0062, ge=0.0, le=1.0, description="the same of yaw")
@@ -67,12 +73,15 @@ class OdometryDrift:
         self._numbers = np.array(
             [s.sigma_m, s.length_m, s.sigma_rad, s.length_rad_m, s.per_rad_m, s.jitter_m, s.jitter_rad, s.lag_s / dt]
         )
+        self._drifts = np.ones(worlds, np.bool_)
 
     def reset(self, world: int, generator: np.random.Generator) -> None:
-        """Begin an episode: the launch poses are known; the generator draws how far each drone will drift."""
+        """Begin an episode: the launch poses are known; the generator draws whether and how far drones will drift."""
         drones, spread = self.error.shape[1], self.settings.spread
         self._keys[world] = generator.integers(2**64, dtype=np.uint64)
         self._scale[world] = np.exp(spread * generator.standard_normal(drones) - spread * spread)  # mean square 1
+        if self.settings.share < 1.0:
+            self._drifts[world] = generator.random() < self.settings.share
         self._ages[world] = 0
         self.error[world] = 0.0
 
@@ -86,12 +95,14 @@ class OdometryDrift:
 
     def kernel_args(self) -> tuple[NDArray[np.generic], ...]:
         """Return what `advance_worlds` takes after the poses, for kernels that call it themselves."""
-        return self.error, self._before, self._scale, self._keys, self._ages, self._numbers, normal_table()
+        return (
+            self.error, self._before, self._scale, self._drifts, self._keys, self._ages, self._numbers, normal_table()
+        )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
 def advance_worlds(  # type: ignore[no-untyped-def]
-    first, last, estimated, poses, error, before, scale, keys, ages, numbers, normal
+    first, last, estimated, poses, error, before, scale, drifts, keys, ages, numbers, normal
 ):
     """Fill `estimated` `[worlds, drones, 3]` of worlds first to last, and carry their drift on by a tick.
 
@@ -100,7 +111,7 @@ def advance_worlds(  # type: ignore[no-untyped-def]
     for world in range(first, last):
         tick_key = key_of(keys[world], ages[world])
         for drone in range(poses.shape[1]):
-            if ages[world] == 0:
+            if ages[world] == 0 or not drifts[world]:
                 before[world, drone] = poses[world, drone]
                 estimated[world, drone] = poses[world, drone]
                 continue

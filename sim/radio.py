@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from pydantic import Field
 
 from imagine.core.config import Settings
 from imagine.sim.propagation import Propagation, disc, fill_reach, path_loss
+from imagine.sim.randomisation import Quantity, draw, positive, within
 
 GROUND = 0
 """Station number of the ground station; drones count from 1."""
@@ -28,11 +29,15 @@ class RadioSettings(Settings):
     least `threshold_dbm`; the path has `exponent_clear` in sight of each other and `exponent_walled` for its whole
     length as soon as one wall stands between, or, where `wall_db` is given, costs that much for every wall instead.
     The defaults are a 2.4 GHz radio of 1 mW: 31.6 m in the clear, 5.6 m behind walls.
+
+    `range_m`, `tx_dbm` and `loss` may be ranges [low, high]: every world and episode, or flight, draws its own numbers.
     """
 
     model: Literal["disc", "path-loss"] = "disc"
-    range_m: float = Field(default=5.0, gt=0.0, description="disc: distance at which two drones still hear each other")
-    tx_dbm: float = Field(default=0.0, ge=-60.0, le=40.0, description="path-loss: transmitted power")
+    range_m: Annotated[Quantity, positive()] = Field(
+        default=5.0, description="disc: distance at which two drones still hear each other"
+    )
+    tx_dbm: Annotated[Quantity, within(-60.0, 40.0)] = Field(default=0.0, description="path-loss: transmitted power")
     loss_1m_db: float = Field(default=40.0, ge=0.0, le=100.0, description="path-loss: over the first metre, 2.4 GHz")
     threshold_dbm: float = Field(default=-70.0, ge=-150.0, le=0.0, description="path-loss: least power that is heard")
     exponent_clear: float = Field(default=2.0, ge=1.0, le=8.0, description="path-loss: exponent in the clear")
@@ -43,16 +48,26 @@ class RadioSettings(Settings):
     ground_range_m: float | None = Field(default=None, gt=0.0, description="the ground station's range; none: any")
     rate_bps: float = Field(default=250_000.0, gt=0.0, description="bits per second of each sender")
     latency_s: float = Field(default=0.02, ge=0.0, le=10.0, description="delay on top of the time on air")
-    loss: float = Field(default=0.0, ge=0.0, le=1.0, description="chance that a receiver in range misses a datagram")
+    loss: Annotated[Quantity, within(0.0, 1.0)] = Field(
+        default=0.0, description="chance that a receiver in range misses a datagram"
+    )
     queue_bytes: int = Field(default=16_384, ge=1, description="what waits to be sent; more is dropped")
 
     @property
     def propagation(self) -> Propagation:
-        """How far drones hear each other, in the numbers that the kernels of `sim.propagation` take."""
+        """How far drones hear each other, in the numbers of `sim.propagation`'s kernels; of ranges it is the middle."""
         if self.model == "disc":
-            return disc(self.range_m)
-        budget_db = self.tx_dbm - self.loss_1m_db - self.threshold_dbm
+            return disc(draw(self.range_m, None))
+        budget_db = draw(self.tx_dbm, None) - self.loss_1m_db - self.threshold_dbm
         return path_loss(budget_db, self.exponent_clear, self.exponent_walled, self.wall_db)
+
+    def drawn(self, rng: np.random.Generator) -> RadioSettings:
+        """Return these settings with a number drawn from every range; without ranges nothing is drawn."""
+        ranges = {name: value for name in _DRAWN if isinstance(value := getattr(self, name), tuple)}
+        return self.model_copy(update={name: draw(value, rng) for name, value in ranges.items()}) if ranges else self
+
+
+_DRAWN = ("range_m", "tx_dbm", "loss")
 
 
 @dataclass
@@ -98,12 +113,12 @@ class RadioMedium:
         rng: np.random.Generator,
         walls: NDArray[np.float64] | None = None,
     ) -> None:
-        """`rng` draws the losses; `walls` `[n, 4]` (x0, y0, x1, y1), metres, are the faces of all walls."""
-        self.settings = settings
+        """`rng` draws from ranges, then the losses; `walls` `[n, 4]` (x0, y0, x1, y1), metres, are all walls' faces."""
+        self.settings = settings = settings.drawn(rng)
         self.stations = drones + 1
         self.sent = [StationCounters() for _ in range(self.stations)]
         self.links = [[LinkCounters() for _ in range(self.stations)] for _ in range(self.stations)]
-        self._rng = rng
+        self._rng, self._loss = rng, draw(settings.loss, None)
         self._walls = np.empty((0, 4)) if walls is None else np.ascontiguousarray(walls, np.float64)
         self._propagation = settings.propagation
         self._busy_until = [0.0] * self.stations
@@ -143,7 +158,7 @@ class RadioMedium:
                 link = self.links[sender][receiver]
                 if not reach[sender, receiver]:
                     link.out_of_range += 1
-                elif self.settings.loss > 0.0 and self._rng.random() < self.settings.loss:
+                elif self._loss > 0.0 and self._rng.random() < self._loss:
                     link.lost += 1
                     link.lost_bytes += len(datagram)
                 else:

@@ -30,8 +30,9 @@ class MapArrays(NamedTuple):
     the version of each tile, `clocks` uint32 the greatest version a drone has given, `changed` int64 how many cells of
     its own layer the newest scan changed. `belief` int8, `states`, `kinds` and `cost` (padded planning grids, see
     `imagine.core.frontier`) are derived; `dirty` uint8 tells the tiles of a drone whose layers changed since.
-    `seen` bool `[worlds, rows, columns]` is what the team has ever known, `discovered` counts the cells each drone saw
-    first, `frontiers` whether it knows of any. `origins` int64 are the grid's first column and row in map cells.
+    `seen` bool `[worlds, rows, columns]` is what the team has ever known, `fresh` uint8 `[worlds, tile rows, tile
+    columns]` tells where it saw coverable cells since `CriticImages` last looked. `discovered` counts the cells each
+    drone saw first, `frontiers` whether it knows of any. `origins` int64 are the grid's first column and row in cells.
     """
 
     layers: NDArray[np.int8]
@@ -44,6 +45,7 @@ class MapArrays(NamedTuple):
     cost: NDArray[np.int16]
     dirty: NDArray[np.uint8]
     seen: NDArray[np.bool_]
+    fresh: NDArray[np.uint8]
     coverable: NDArray[np.bool_]
     discovered: NDArray[np.int64]
     gained: NDArray[np.int64]
@@ -99,6 +101,7 @@ class TeamMaps:
             cost=np.full((worlds, drones, *padded), BLOCKED, np.int16),
             dirty=np.zeros((worlds, drones, *tiles), np.uint8),
             seen=np.zeros((worlds, rows, columns), np.bool_),
+            fresh=np.zeros((worlds, *tiles), np.uint8),
             coverable=np.zeros((worlds, rows, columns), np.bool_),
             discovered=np.zeros((worlds, drones), np.int64),
             gained=np.zeros((worlds, drones), np.int64),
@@ -123,7 +126,8 @@ class TeamMaps:
         arrays = self.arrays
         for array in (
             arrays.layers, arrays.versions, arrays.clocks, arrays.belief, arrays.states, arrays.kinds, arrays.dirty,
-            arrays.seen, arrays.coverable, arrays.discovered, arrays.gained, arrays.changed, arrays.frontiers,
+            arrays.seen, arrays.fresh, arrays.coverable, arrays.discovered, arrays.gained, arrays.changed,
+            arrays.frontiers,
         ):  # fmt: skip
             array[world] = 0
         arrays.cost[world] = BLOCKED
@@ -162,7 +166,10 @@ def integrate_scan_of(world, drone, maps, pens, ranges, pose, places, marks, kep
             if touched[i, j]:
                 versions[i, j] = maps.clocks[world, drone]
                 dirty[i, j] = 1
-                maps.gained[world, drone] += _see(cells, maps.seen[world], maps.coverable[world], i, j)
+                gained = _see(cells, maps.seen[world], maps.coverable[world], i, j)
+                if gained > 0:
+                    maps.gained[world, drone] += gained
+                    maps.fresh[world, i, j] = 1
     maps.discovered[world, drone] += maps.gained[world, drone]
 
 

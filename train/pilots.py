@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +31,34 @@ class Pilot(Protocol):
 
 
 class RandomPilot:
-    """Draws every action uniformly from [-1, 1]."""
+    """Draws every action uniformly from [-1, 1], in each world from a generator of its own.
+
+    What is drawn in a world depends on the generator given at first and on the world's key, not on the other worlds.
+    """
 
     name = "random"
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._rng = rng
+        self._seed = int(rng.integers(2**63))
+        self._generators: list[np.random.Generator] = []
+
+    def begin(self, env: Exploration) -> None:
+        """Begin each world's draws."""
+        self._generators = [np.random.default_rng([self._seed, key]) for key in env.twin.world_keys]
+
+    def forget(self, worlds: NDArray[np.bool_]) -> None:
+        """Keep nothing: the draws go on."""
+
+    def act(self, env: Exploration, observation: Observation) -> Actions:
+        """Return a draw."""
+        shape = (env.drones, env.settings.action.size)
+        return np.stack([rng.uniform(-1.0, 1.0, shape).astype(np.float32) for rng in self._generators])
+
+
+class RescuePilot:
+    """The planner that also rescues in flight: each drone descends its own belief's frontier field."""
+
+    name = "frontier"
 
     def begin(self, env: Exploration) -> None:
         """Keep nothing."""
@@ -45,6 +67,5 @@ class RandomPilot:
         """Keep nothing."""
 
     def act(self, env: Exploration, observation: Observation) -> Actions:
-        """Return a draw."""
-        shape: tuple[Any, ...] = (env.worlds, env.drones, env.settings.action.size)
-        return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+        """Return the planner's actions, nan where a drone is dead or sees no frontier."""
+        return env.planner_actions()

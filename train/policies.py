@@ -1,4 +1,4 @@
-"""Policies as evaluation sees them: a name and a function from a batch of observations to a batch of actions."""
+"""Networks that fly: a name, a function from a batch of observations to one of actions, and the pilot made of it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ from numpy.typing import NDArray
 from imagine.core.errors import InputError
 from imagine.core.lidar import PRESETS, LidarSpec
 from imagine.onboard.policy import OnnxPolicy
+from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.checkpoint import actor_of, load_checkpoint
 from imagine.train.networks import Actor
+from imagine.train.pilots import Actions
 from imagine.train.rollout import OBSERVATION_KEYS
 
 Arrays = dict[str, NDArray[np.float32]]
+_LEAST_ROWS = 32  # matrix products of fewer rows are summed in another order, and an episode would hang on the others
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,31 @@ class Policy:
     name: str
     act: Callable[[Arrays], NDArray[np.float32]]
     env: ExplorationSettings | None = None
+
+
+class PolicyPilot:
+    """Flies a batch of worlds by a policy alone: deterministic, without rescue, each drone by its own observation."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.name = policy.name
+        self._policy = policy
+
+    def begin(self, env: Exploration) -> None:
+        """Keep nothing: the policy has no memory."""
+
+    def forget(self, worlds: NDArray[np.bool_]) -> None:
+        """Keep nothing."""
+
+    def act(self, env: Exploration, observation: Observation) -> Actions:
+        """Return the policy's actions, the same for a world whichever others fly beside it."""
+        rows = env.worlds * env.drones
+        flat = {}
+        for key in OBSERVATION_KEYS:
+            array = observation.policy[key]
+            flat[key] = np.zeros((max(rows, _LEAST_ROWS), *array.shape[2:]), np.float32)
+            flat[key][:rows] = array.reshape(rows, *array.shape[2:])
+        actions = self._policy.act(flat)[:rows]
+        return np.clip(actions, -1.0, 1.0).reshape(env.worlds, env.drones, -1)
 
 
 def policy_of(actor: Actor, name: str, env: ExplorationSettings | None = None) -> Policy:
@@ -56,7 +84,9 @@ def load_policy(path: Path) -> Policy:
         checkpoint = load_checkpoint(path)
         return policy_of(actor_of(checkpoint, str(path)), checkpoint.settings.run.name, checkpoint.settings.env)
     contract = OnnxPolicy.load(path).contract  # with all the checks made before a flight
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    options = onnxruntime.SessionOptions()
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads would take the twin's cores
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
     def act(observation: Arrays) -> NDArray[np.float32]:
         result: NDArray[np.float32] = session.run(["action"], {key: observation[key] for key in OBSERVATION_KEYS})[0]

@@ -8,12 +8,14 @@ from pydantic import Field
 
 from imagine.core.config import Settings, load_settings
 from imagine.sim.exploration_settings import ExplorationSettings
+from imagine.train.curriculum_settings import CurriculumSettings
 from imagine.train.imitation import ImitationSettings
 from imagine.train.networks import NetworkSettings
 from imagine.train.ppo import PpoSettings
+from imagine.train.tracking.settings import TrackingSettings
 
 CONFIGS = Path(__file__).parent / "configs"
-"""Folder of the configurations that come with the package: `default.yaml`, `smoke.yaml`."""
+"""Folder of the configurations that come with the package, such as `default.yaml`."""
 
 
 class RunSettings(Settings):
@@ -29,17 +31,19 @@ class RunSettings(Settings):
 
 
 class TrainSettings(Settings):
-    """A training run: environment, networks, imitation, PPO."""
+    """A training run: environment, curriculum, networks, imitation, PPO, tracking."""
 
     run: RunSettings = Field(default_factory=RunSettings)
     env: ExplorationSettings = Field(default_factory=ExplorationSettings)
+    curriculum: CurriculumSettings = Field(default_factory=CurriculumSettings)
     network: NetworkSettings = Field(default_factory=NetworkSettings)
     imitation: ImitationSettings = Field(default_factory=ImitationSettings)
     ppo: PpoSettings = Field(default_factory=PpoSettings)
+    tracking: TrackingSettings = Field(default_factory=TrackingSettings)
 
 
 def load_train_settings(config: Path | None, overrides: tuple[str, ...] = ()) -> TrainSettings:
-    """Read a training configuration: a YAML file, the name of a packaged one (`default`, `smoke`), or None (default).
+    """Read a training configuration: a YAML file, the name of a packaged one (`smoke`), or None (`default`).
 
     Raises InputError with file, line and key.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import logging
 import os
 import signal
 import threading
@@ -22,6 +23,7 @@ from imagine.core.errors import InputError
 from imagine.sim.exploration import Exploration
 from imagine.train.atomic_file import write_atomically
 from imagine.train.checkpoint import Checkpoint, Phase, load_checkpoint, load_weights
+from imagine.train.curriculum import Curriculum
 from imagine.train.evaluation import evaluate
 from imagine.train.imitation import LabelBuffer, collect_labels, learn
 from imagine.train.networks import Actor, Critic
@@ -31,6 +33,8 @@ from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
 from imagine.train.rollout import collect
 from imagine.train.run_folder import RunFolder, run_record
 from imagine.train.settings import TrainSettings, load_train_settings
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,7 @@ def train(
     folder = (
         RunFolder.create(settings)
         if resume is None or checkpoint is None
-        else RunFolder.reopen(_run_path(resume), sum(checkpoint.agent_steps.values()))
+        else RunFolder.reopen(_run_path(resume), sum(checkpoint.agent_steps.values()), settings)
     )
     try:
         with stop_requests() as stop:
@@ -131,14 +135,17 @@ class Trainer:
     phase: Phase = "imitation"
 
     def __post_init__(self) -> None:
-        self.env = Exploration(self.settings.env, self.settings.run.seed)
+        self.curriculum = Curriculum(self.settings.curriculum, self.settings.env)
+        if self.resumed is not None and "curriculum" in self.resumed.record:
+            self.curriculum.load_state_dict(self.resumed.record["curriculum"])
+        self.env = Exploration(self.curriculum.environment, self.settings.run.seed)
         if self.resumed is not None:
             self.env.load_state_dict(self.resumed.env)
         self._observation = self.env.reset()
         # Set here, whatever OMP_NUM_THREADS says: sums are split by thread, and equal settings must give equal runs.
         torch.set_num_threads(self.settings.run.threads or len(os.sched_getaffinity(0)))
         self.learner = Learner.create(self.settings)
-        self.episodes = RecentEpisodes(self.settings.env.episode_ticks)
+        self.episodes = RecentEpisodes(self.settings.env.episode_ticks, self.settings.env.levels)
         self._wall_before_s = 0.0
         if self.resumed is not None:
             self.learner.restore(self.resumed)
@@ -212,6 +219,11 @@ class Trainer:
         self.updates += 1
         self.agent_steps[self.phase] += steps
         self.episodes.add(episodes)
+        events = self.curriculum.observe(episodes, sum(self.agent_steps.values()))
+        for event in events:
+            logger.log(logging.WARNING if event.kind == "given up" else logging.INFO, "%s", event)
+        if events:
+            self.env.set_level_weights(self.curriculum.level_weights())
         report = Report(
             phase=self.phase,
             agent_steps=sum(self.agent_steps.values()),
@@ -219,11 +231,12 @@ class Trainer:
             phase_total=total,
             numbers=numbers,
             levels=self.episodes.means(),
+            drones=self.episodes.drone_means(),
             steps_per_s=steps / sum(seconds.values()),
             seconds=seconds,
             wall_s=self._wall_s(),
         )
-        self._folder.log(report.agent_steps, report.scalars(), report.row())
+        self._folder.log(report.agent_steps, {**report.scalars(), **self.curriculum.scalars()})
         self._report(report)
         if time.monotonic() - self._saved >= self.settings.run.checkpoint_every_s:
             self._saved = time.monotonic()
@@ -247,7 +260,11 @@ class Trainer:
             },
             rngs={"torch": learner.generator.get_state(), "numpy": learner.rng.bit_generator.state},
             env=self.env.state_dict(),
-            record={**run_record(self.settings), "levels": self.episodes.means()},
+            record={
+                **run_record(self.settings),
+                "levels": self.episodes.summary(),
+                "curriculum": self.curriculum.state_dict(),
+            },
         )
 
     def _evaluate(self, checkpoint: Path) -> None:
@@ -255,7 +272,7 @@ class Trainer:
         settings = self.settings
         rows = evaluate(
             policy_of(self.learner.actor, settings.run.name),
-            levels=sorted(set(settings.env.levels)),
+            levels=sorted(set(self.curriculum.levels)),
             drones=(settings.env.drones,),
             protocol=settings.env.protocol,
             episodes=settings.run.final_episodes,

@@ -20,6 +20,7 @@ from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.exploration_tick import STAGES as BATCH_STAGES
 from imagine.sim.level import Level, load_level, mirrored
+from imagine.sim.level_names import expand_levels
 from imagine.sim.lidar_model import LidarModel
 from imagine.sim.plain.field import heap_ways, scipy_ways
 from imagine.sim.plain.handover import hand_over_maps, hand_over_mesh
@@ -72,9 +73,9 @@ class PlainExploration:
         self.lidar = settings.lidar_spec
         self.drones = settings.drones
         self._means = means(variant)
-        self._levels = [_variants(load_level(name), settings.mirror) for name in settings.levels]
-        weights = np.array(settings.level_weights or (1.0,) * len(self._levels), float)
-        self._weights = weights / weights.sum()
+        names, shares = expand_levels(settings.levels, settings.level_weights)
+        self._levels = [_variants(load_level(name), settings.mirror) for name in names]
+        self._weights = np.array(shares)
         self._generator = np.random.default_rng([seed, world])
         self._noise, self._losses = np.random.default_rng([seed, world, 1]), np.random.default_rng([seed, world, 2])
         self._clock = clock or (lambda: 0.0)
@@ -262,10 +263,14 @@ def means(variant: Variant) -> Means:
 
 
 def _check(settings: ExplorationSettings) -> None:
+    radio = settings.radio
     lacking = {
         "dynamics": settings.dynamics != DynamicsSettings(),
         "sensing": settings.sensing != LidarModel(),
         "drift": settings.drift.enabled,
+        "ranges of radio or budget": any(
+            isinstance(value, tuple) for value in (radio.range_m, radio.tx_dbm, radio.loss, settings.budget_bytes_per_s)
+        ),
         "observation: position, heading, peers, visits": settings.observation.version != 1,
     }
     for name, is_asked_for in lacking.items():

@@ -52,16 +52,18 @@ def everything(hall: str, **changes: Any) -> ExplorationSettings:
         "observation": ObservationSpec(
             view_cells=16, position=True, heading=True, peers=2, visits="team", axes="heading", visits_full_ticks=20
         ),
-        "radio": RadioSettings(model="path-loss", loss=0.15, latency_s=0.07),
+        "radio": RadioSettings(model="path-loss", tx_dbm=(-4.0, 2.0), loss=(0.1, 0.2), latency_s=0.07),
         "reward": RewardSettings(
             collision_penalty=0.5, kill_on_collision=True, step_cost=0.001, completion_bonus=1.0, normalise="sweep"
         ),
         "dynamics": DynamicsSettings(
             lag_s=(0.05, 0.4), drag_per_s=(0.0, 0.6), mass_kg=(0.05, 0.5), delay_s=(0.0, 0.3), wind_mps=(0.0, 0.3)
         ),
-        "drift": DriftSettings(enabled=True),
+        "budget_bytes_per_s": (4000.0, 31250.0),
+        "drift": DriftSettings(enabled=True, share=0.8),
         "sensing": LidarModel(
-            noise_per_m=0.002, noise_scale=(0.5, 2.0), dropout=(0.0, 0.1), miss_at_max=0.2, dark_share=0.05, skew=True
+            noise_per_m=0.002, noise_scale=(0.5, 2.0), dropout=(0.0, 0.1), miss_at_max=(0.1, 0.3),
+            dark_share=(0.0, 0.1), skew=True,
         ),
     }  # fmt: skip
     return ExplorationSettings(**(settings | changes))

@@ -26,7 +26,7 @@ from imagine.mesh_comm.node import MeshNode, MeshSettings
 from imagine.mesh_comm.scan_exchange import scan_message
 from imagine.mesh_comm.seal import KEY_BYTES, OVERHEAD, Sealer
 from imagine.onboard.teammates import peer_poses
-from imagine.sim.air import DIGEST, SCAN, STATUS, TILES
+from imagine.sim.air import DIGEST, LOSS, SCAN, STATUS, TILES
 from imagine.sim.air_receive import _chance
 from imagine.sim.exploration import Exploration
 
@@ -149,7 +149,10 @@ class TeamOnBoard:
             for own in self.drones:
                 if not reach[message.sender, own.at[1]]:
                     continue
-                if _chance(key, tick, message.sender, own.at[1], message.sequence) < self.rules.loss:
+                if (
+                    _chance(key, tick, message.sender, own.at[1], message.sequence)
+                    < self.env.air.state.media[self.world, LOSS]
+                ):
                     self.lost += 1
                     continue
                 own.node.receive(message.datagram, now)

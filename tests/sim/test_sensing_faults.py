@@ -116,7 +116,7 @@ def test_skewed_scans_have_the_same_faults() -> None:
         ("dropout", [0.2, 0.1], "lowest first"),
         ("dropout", [0.0, 1.5], "within 0 and 1"),
         ("noise_scale", [-0.1, 1.0], "within 0 and 10"),
-        ("noise_per_m", 0.5, "less than or equal to 0.1"),
+        ("noise_per_m", 0.5, "within 0 and 0.1"),
         ("dark_range_m", 0.0, "greater than 0"),
         ("noise_std", 0.1, "did you mean 'noise_std_m'"),
     ],

@@ -11,26 +11,34 @@ from imagine.sim.film import Film
 from imagine.sim.metrics import BYTE_KINDS, EpisodeMetrics
 from imagine.sim.radio import RadioSettings
 from imagine.sim.twin import TICK_S
-from imagine.train.evaluation import bootstrap_interval, evaluate, named_policy, row, run_episodes
-from imagine.train.evaluation_env import evaluation_env
+from imagine.train.evaluation import (
+    bootstrap_interval,
+    contender_of,
+    evaluate,
+    evaluation_env,
+    row,
+    run_episodes,
+    shared_envs,
+)
 from imagine.train.networks import Actor, NetworkSettings
 from imagine.train.policies import policy_of
 
 KEYS = [
-    "policy", "level", "drones", "protocol", "episodes", "coverage_mean", "coverage_ci95", "t90_mean", "t90_reached",
-    "t95_mean", "t95_reached", "t99_mean", "t99_reached", "overlap", "collisions_per_episode", "path_m",
-    "bytes_per_drone", "bytes_sent", "collisions_by_kind", "productivity_ratio", "link_share", "survivors",
+    "policy", "level", "drones", "protocol", "episodes", "coverage_mean", "coverage_ci95", "coverage_min",
+    "coverage_at", "t90_mean", "t90_ci95", "t90_reached", "t95_mean", "t95_reached", "t99_mean", "t99_reached",
+    "overlap", "collisions_per_episode", "collisions_per_drone", "path_m", "bytes_per_drone", "bytes_sent",
+    "collisions_by_kind", "productivity_ratio", "link_share", "survivors", "paired",
 ]  # fmt: skip
 SHORT = ExplorationSettings(episode_ticks=150, observation=ObservationSpec(view_cells=16, lidar_sectors=16))
 
 
 def test_a_row_for_each_level_and_team_with_the_documented_keys():
     rows = evaluate("frontier", ["0", "1"], drones=(1, 2), episodes=2, seed=4, env=SHORT)
-    assert [(row["level"], row["drones"]) for row in rows] == [("0", 1), ("0", 2), ("1", 1), ("1", 2)]
+    assert [(row["level"], row["drones"]) for row in rows] == [("0", 1), ("1", 1), ("0", 2), ("1", 2)]
     assert all(list(row) == KEYS for row in rows)
     assert json.loads(json.dumps(rows)) is not None
     assert rows[0]["coverage_mean"] > 0.95
-    alone, together = rows[0]["bytes_sent"], rows[1]["bytes_sent"]
+    alone, together = rows[0]["bytes_sent"], rows[2]["bytes_sent"]
     assert [kind for kind in BYTE_KINDS if alone[kind] > 0.0] == ["status"]  # for the ground: no peer to tell more
     assert all(together[kind] > 0.0 for kind in BYTE_KINDS)
 
@@ -57,7 +65,7 @@ def episode(coverage=0.5, t90=None, **changes):
     zeros = np.zeros(2, np.int64)
     given = {
         "world": 0, "seed": 0, "level": "x", "ticks": 500, "coverage": coverage,
-        "curve": np.array([coverage], np.float32), "t90": t90, "t95": None, "t99": None, "overlap": 1.5,
+        "curve": np.full(500, coverage, np.float32), "t90": t90, "t95": None, "t99": None, "overlap": 1.5,
         "path_m": np.array([2.0, 4.0]), "discovered": zeros, "drone_curves": np.zeros((2, 1), np.float32),
         "known": zeros, "contacts": 1, "link_ticks": zeros, "pair_ticks": np.zeros((2, 2), np.int64),
         "alive_ticks": zeros + 500, "contacts_by": np.array([[1, 0, 0], [0, 0, 0]]),
@@ -67,7 +75,7 @@ def episode(coverage=0.5, t90=None, **changes):
 
 
 def row_of(*episodes):
-    return row("p", "x", 2, "one-hop", episodes, SHORT, 0)
+    return row("p", "x", 2, "one-hop", episodes, SHORT.episode_ticks, 0)
 
 
 def test_an_episode_that_never_gets_there_counts_with_its_full_length():
@@ -78,6 +86,16 @@ def test_an_episode_that_never_gets_there_counts_with_its_full_length():
     assert numbers["t99_mean"] == 150.0
     assert numbers["path_m"] == 3.0
     assert numbers["collisions_per_episode"] == 1.0
+    assert numbers["collisions_per_drone"] == 0.5
+    assert numbers["coverage_min"] == 0.5
+    low, high = numbers["t90_ci95"]
+    assert (low, high) == (100.0, 150.0)
+
+
+def test_coverage_is_told_at_ticks_that_episodes_last_and_stays_after_an_end():
+    ended = episode(0.8, ticks=50, curve=np.linspace(0.016, 0.8, 50).astype(np.float32))
+    longer = episode(0.4, ticks=150, curve=np.linspace(0.4 / 150, 0.4, 150).astype(np.float32))
+    assert row_of(ended, longer)["coverage_at"] == {"100": pytest.approx((0.8 + 0.4 * 100 / 150) / 2, abs=1e-6)}
 
 
 def test_bytes_are_told_for_a_drone_by_kind():
@@ -95,7 +113,7 @@ def test_contacts_are_told_for_the_team_by_kind():
 def test_what_is_told_of_bytes_is_what_the_radio_sent():
     settings = SHORT.model_copy(update={"levels": ("1",), "drones": 2, "mirror": False, "random_launch": False})
     flown = run_episodes("frontier", settings, 1, 3)
-    told = row("frontier", "1", 2, "one-hop", flown, settings, 0)["bytes_sent"]
+    told = row("frontier", "1", 2, "one-hop", flown, settings.episode_ticks, 0)["bytes_sent"]
     budget = RadioSettings().rate_bps / 8.0 * TICK_S * flown[0].ticks + MeshSettings().burst_bytes
     assert all(told[kind] > 0.0 for kind in BYTE_KINDS)
     assert sum(told.values()) <= budget
@@ -141,13 +159,6 @@ def test_the_interval_holds_the_mean_and_narrows_with_more_episodes():
     assert narrow_high - narrow_low < high - low
 
 
-def test_an_unknown_policy_or_level_is_named():
-    with pytest.raises(InputError, match=r"nowhere\.onnx: no such policy"):
-        named_policy("nowhere.onnx")
-    with pytest.raises(InputError, match="77"):
-        evaluate("random", ["77"], episodes=1)
-
-
 def test_all_levels_are_loaded_before_any_is_flown(tmp_path):
     closet = tmp_path / "closet.yaml"
     closet.write_text("{size_m: [2, 2], launch: [1, 1]}")
@@ -160,20 +171,24 @@ def test_all_levels_are_loaded_before_any_is_flown(tmp_path):
 
 def test_overrides_are_laid_over_what_the_policy_was_made_for():
     made_for = SHORT.model_copy(update={"episode_ticks": 70})
-    policy = policy_of(Actor(NetworkSettings(), SHORT.observation, 2), "mine", made_for)
+    policy = contender_of(policy_of(Actor(NetworkSettings(), SHORT.observation, 2), "mine", made_for))
     changed = evaluation_env(policy, ["env.dynamics.wind_mps=0.5", "env.budget_bytes_per_s=2000"])
     assert changed.dynamics.wind_mps == 0.5
     assert changed.mesh.rate_bytes_per_s == 2000.0
     assert changed.observation == SHORT.observation
     assert changed.episode_ticks == 70
     assert evaluation_env(policy) == made_for
-    assert evaluation_env("frontier", ["env.episode_ticks=9"]) == ExplorationSettings(episode_ticks=9)
+    assert evaluation_env(contender_of("frontier"), ["env.episode_ticks=9"]) == ExplorationSettings(episode_ticks=9)
 
 
 def test_an_override_changes_what_is_flown():
     calm, windy = (
         evaluate(
-            "random", ["1"], drones=(2,), episodes=1, env=evaluation_env("random", ["env.episode_ticks=60", *more])
+            "random",
+            ["1"],
+            drones=(2,),
+            episodes=1,
+            env=evaluation_env(contender_of("random"), ["env.episode_ticks=60", *more]),
         )
         for more in ([], ["env.dynamics.wind_mps=0.5"])
     )
@@ -195,4 +210,23 @@ def test_an_override_changes_what_is_flown():
 def test_overrides_that_cannot_be_are_refused(override, said):
     policy = policy_of(Actor(NetworkSettings(), SHORT.observation, 2), "mine", SHORT)
     with pytest.raises(InputError, match=said):
-        evaluation_env(policy, [override])
+        evaluation_env(contender_of(policy), [override])
+
+
+def network(name, env):
+    return contender_of(policy_of(Actor(NetworkSettings(), env.observation, env.action.size), name, env))
+
+
+def test_all_fly_the_environment_of_the_first_network_each_with_its_own_eyes():
+    first = SHORT.model_copy(update={"episode_ticks": 70})
+    second = ExplorationSettings(observation=ObservationSpec(view_cells=24))
+    envs = shared_envs([contender_of("frontier"), network("a", first), network("b", second)], ["env.stop_coverage=0.9"])
+    assert [env.episode_ticks for env in envs] == [70, 70, 70]
+    assert [env.stop_coverage for env in envs] == [0.9, 0.9, 0.9]
+    assert [env.observation.view_cells for env in envs] == [16, 16, 24]
+
+
+def test_networks_for_different_sensors_are_not_compared():
+    other = SHORT.model_copy(update={"lidar_beams": 90})
+    with pytest.raises(InputError, match="b: was made for another lidar_beams than a"):
+        shared_envs([network("a", SHORT), network("b", other)])
