@@ -35,7 +35,7 @@ $(VENV)/.pilot: pyproject.toml constraints.txt | $(VENV)/.made
 	@touch $@
 
 $(VENV)/.developer: pyproject.toml constraints.txt | $(VENV)/.made
-	$(PIP) --editable '.[gcs,train,dev]'
+	$(PIP) --editable '.[gcs,train,study,dev]'
 	@touch $@ $(VENV)/.pilot
 
 $(VENV)/.made:

@@ -240,6 +240,30 @@ def train(
 
 
 @app.command()
+def study(
+    file: Annotated[Path, typer.Argument(metavar="STUDY", help="a study's YAML, or a packaged one such as paradigms")],
+    address: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="head of a Ray cluster; by default one of this machine's own"),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="keep the trials that ended, go on with the others")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="check and show the trials, run none")] = False,
+    cpus: Annotated[int | None, typer.Option(min=1, help="of this machine; by default all")] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="override a setting of the study")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Train many policies that differ in chosen settings, on Ray, and compare them."""
+    _needs("torch", "train")
+    _needs("ray", "study")
+    check_outputs(json_file)
+    from imagine.study_command import study_and_show
+
+    study_and_show(file, address, resume, dry_run, cpus, overrides or [], json_file)
+
+
+@app.command()
 def evaluate(
     policy: Annotated[
         list[str] | None,

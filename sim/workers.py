@@ -16,8 +16,8 @@ class Workers:
     """Runs kernels `kernel(first, last, *arguments)` over parts of a range, on every core this process may use."""
 
     def __init__(self, threads: int | None = None) -> None:
-        """Prepare `threads` threads; by default one for each core."""
-        self.threads = threads or len(os.sched_getaffinity(0))
+        """Prepare `threads` threads; by default as many as IMAGINE_THREADS says, or else one for each core."""
+        self.threads = threads or _threads_here()
         self._pool = ThreadPoolExecutor(self.threads, "worlds") if self.threads > 1 else None
 
     def over(
@@ -40,3 +40,9 @@ class Workers:
         kernel(bounds[0], bounds[1], *arguments, *own[0])
         for job in jobs:
             job.result()
+
+
+def _threads_here() -> int:
+    """Return how many threads this process may keep busy: where many share a machine, each is told its part."""
+    told = os.environ.get("IMAGINE_THREADS", "")
+    return max(1, int(told)) if told.isdecimal() else len(os.sched_getaffinity(0))

@@ -89,7 +89,7 @@ def collect_labels(
             elif isinstance(buffer, LabelBuffer):
                 buffer.add({key: value[labelled] for key, value in seen.items()}, labels[labelled])
             decisions = next_decisions(actor, {**seen, "alive": alive.to(actor.device)}, recall, env.drones)
-            drawn, _ = actor.draw(decisions, generator)
+            drawn, _ = actor.draw(decisions, actor.noise((agents,), generator))
             actions = actor.flown(seen, drawn).cpu()
             by_planner = planner_flies & labelled
             actions[by_planner] = labels[by_planner]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -84,6 +85,17 @@ class Rollout:
         """Steps that are learned from together; 1 without memory."""
         return 1 if self.states is None else self.actions.shape[0] // self.states.shape[0]
 
+    def to(self, device: torch.device) -> Rollout:
+        """Return the rollout on another device."""
+        moved: dict[str, Any] = {}
+        for key in fields(self):
+            value = getattr(self, key.name)
+            if isinstance(value, Tensor):
+                moved[key.name] = value.to(device)
+            elif key.name in ("observations", "last"):
+                moved[key.name] = {name: part.to(device) for name, part in value.items()}
+        return replace(self, **moved)
+
 
 def policy_tensors(observation: Observation) -> Seen:
     """Return what the policy sees, `[worlds, drones, ...]`, as tensors `[agents, ...]`, good as long as it is."""
@@ -153,27 +165,29 @@ def collect(
     precision: Precision = "float32",
     recall: Recall | None = None,
     sequence_steps: int = 16,
+    noise: Tensor | None = None,
 ) -> tuple[Rollout, Observation]:
     """Act `steps` times by draws from the policy; return the rollout and the observation to go on from.
 
-    `recall` is what is remembered so far, and is brought up to date; without one everybody's episode begins. What is
+    `noise`, as `Actor.noise` gives it, is taken instead of draws from `generator`. `recall` is what is remembered so far, and is brought up to date; without one everybody's episode begins. What is
     learned from together are `sequence_steps` steps, or as many fewer as divide `steps`.
     """
     with at_precision(precision, actor):
         recall = recall or Recall.nothing(actor, env.worlds * env.drones)
-        return _collect(env, observation, actor, steps, generator, recall, chunk_steps(steps, sequence_steps))
+        if noise is None:
+            noise = actor.noise((steps, env.worlds * env.drones), generator)
+        return _collect(env, observation, actor, noise, recall, chunk_steps(steps, sequence_steps))
 
 
 def _collect(
     env: Exploration,
     observation: Observation,
     actor: Actor,
-    steps: int,
-    generator: torch.Generator,
+    noise: Tensor,
     recall: Recall,
     chunk: int,
 ) -> tuple[Rollout, Observation]:
-    agents, device = env.worlds * env.drones, actor.device
+    steps, agents, device = len(noise), env.worlds * env.drones, actor.device
     images, sees_level = image_dtype(actor), actor.paradigm != "dtde"
     kept = room_for(steps, stored(agent_tensors(observation, sees_level), images, device))
     actions = torch.empty((steps, agents, actor.taken_size), device=device)
@@ -193,7 +207,7 @@ def _collect(
             if t % chunk == 0:
                 states.append(recall.state.clone())
         decisions = next_decisions(actor, {**seen, "alive": alive[t]}, recall, env.drones)
-        actions[t], log_probs[t] = actor.draw(decisions, generator)
+        actions[t], log_probs[t] = actor.draw(decisions, noise[t])
         began = time.perf_counter()
         step = env.step(env_actions(actor.flown(seen, actions[t]), env))
         env_s += time.perf_counter() - began

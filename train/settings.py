@@ -26,6 +26,7 @@ class RunSettings(Settings):
     seed: int = Field(default=0, ge=0)
     device: DeviceName = Field(default="auto", description="of networks and rollouts; auto: CUDA where there is one")
     threads: int | None = Field(default=None, ge=1, description="of torch; none: one for each core")
+    rollout_workers: int = Field(default=0, ge=0, description="of Ray, which share the worlds; 0: this process flies")
     checkpoint_every_s: float = Field(default=60.0, gt=0.0)
     keep_checkpoints: int = Field(default=3, ge=1, description="numbered checkpoints kept beside the latest")
     final_episodes: int = Field(default=8, ge=0, description="evaluated on each level at the end; 0: none")

@@ -7,7 +7,8 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,8 @@ from imagine.train.learner import Learner
 from imagine.train.policies import policy_of
 from imagine.train.ppo import update
 from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
-from imagine.train.rollout import Recall, collect
+from imagine.train.rollout import Recall
+from imagine.train.rollout_source import OwnRollouts, RolloutSource, recall_of
 from imagine.train.run_folder import RunFolder, run_record
 from imagine.train.settings import TrainSettings, load_train_settings
 from imagine.train.stopping import stop_requests
@@ -98,17 +100,14 @@ class Trainer:
         if self.resumed is not None:
             self.curriculum.load_state_dict(self.resumed.progress["curriculum"])
         self.env = Exploration(self.curriculum.environment, self.settings.run.seed)
-        if self.resumed is None:
-            self._observation = self.env.reset()
-        else:
-            self.env.load_state_dict(self.resumed.env)
-            self._observation = self.env.observation()
         # Set here, whatever OMP_NUM_THREADS says: sums are split by thread, and equal settings must give equal runs.
         torch.set_num_threads(self.settings.run.threads or len(os.sched_getaffinity(0)))
         self.learner = Learner.create(self.settings)
         self.episodes = RecentEpisodes(self.settings.env.episode_ticks, self.settings.env.levels)
         self._wall_before_s = 0.0
-        self._recall = Recall.nothing(self.learner.actor, self.env.worlds * self.env.drones)
+        self._source: RolloutSource | None = None
+        self._last: Checkpoint | None = None
+        self._take_up(None if self.resumed is None else self.resumed.env)
         if self.resumed is not None:
             check_same_network(self.resumed, self.settings, "checkpoint")
             self.learner.restore(self.resumed)
@@ -116,8 +115,18 @@ class Trainer:
             self.updates, self.phase = self.resumed.updates, self.resumed.phase
             self._wall_before_s = self.resumed.wall_s
             self.episodes.load_state_dict(self.resumed.progress["episodes"])
-            kept, device = self.resumed.progress["recall"], self.learner.actor.device
-            self._recall = Recall(kept["state"].to(device), kept["starts"].to(device))
+
+    def _take_up(self, state: dict[str, Any] | None) -> None:
+        """Let the environment of this process go on from a checkpoint's state, or begin."""
+        workers, saved = self.settings.run.rollout_workers, len((state or {}).get("workers", []))
+        if state is not None and saved != workers:
+            raise InputError(f"run.rollout_workers: the run was saved with {saved} workers, not {workers}")
+        self._recall = Recall.nothing(self.learner.actor, self.env.worlds * self.env.drones)
+        if state is None or saved:
+            self._observation = self.env.reset()
+        else:
+            self._observation = self.env.load_state_dict(state["env"])
+            self._recall = recall_of(state["recall"], self.learner.actor.device)
 
     def run(self, folder: RunFolder, report: Reporter, stop: threading.Event) -> RunResult:
         """Train until both phases are done or `stop` is set; leave a checkpoint either way.
@@ -139,8 +148,8 @@ class Trainer:
             raise WorkError(f"{error}{where}") from error
         finished = not stop.is_set()
         checkpoint = latest
-        if self.phase == "ppo":
-            checkpoint = folder.save(self.checkpoint(), "final" if finished else None)
+        if self._last is not None:
+            checkpoint = folder.save(self._last, "final" if finished else None)
         if finished and self.settings.run.final_episodes:
             self._evaluate(checkpoint)
         return RunResult(folder.path, checkpoint, sum(self.agent_steps.values()), finished, self.episodes.means())
@@ -170,29 +179,51 @@ class Trainer:
             self._after_update(steps, settings.agent_steps, numbers, seconds, episodes)
         if not self._stop.is_set():
             self.phase, self.updates = "ppo", 0
+            if not self.settings.run.rollout_workers:
+                self._source = self._own_rollouts()
             self._folder.save(self.checkpoint(), "imitated")
+
+    def _own_rollouts(self) -> OwnRollouts:
+        return OwnRollouts(self.env, self._observation, self._recall, self.settings.ppo)
+
+    @contextmanager
+    def _rollouts(self) -> Iterator[RolloutSource]:
+        """Give whoever flies rollouts, for as long as it takes."""
+        run, learner = self.settings.run, self.learner
+        with ExitStack() as stack:
+            if run.rollout_workers:
+                from imagine.train.rollout_workers import rollout_workers  # brings Ray
+
+                state = None if self.resumed is None else self.resumed.env
+                self._source = stack.enter_context(
+                    rollout_workers(
+                        self.curriculum.environment, run.seed, self.settings.ppo, learner.actor, run.rollout_workers,
+                        state,
+                    )
+                )  # fmt: skip
+            self._source = self._source or self._own_rollouts()
+            yield self._source
 
     def _improve(self) -> None:
         """Fly rollouts and improve the policy by PPO; the critic alone learns during its warm-up."""
         settings, learner = self.settings.ppo, self.learner
-        while self.agent_steps["ppo"] < settings.agent_steps and not self._stop.is_set():
-            began = time.monotonic()
-            rollout, self._observation = collect(
-                self.env, self._observation, learner.actor, settings.rollout_steps, learner.generator,
-                settings.precision, self._recall, settings.sequence_steps,
-            )  # fmt: skip
-            collected = time.monotonic()
-            numbers = update(
-                learner.actor, learner.critic, learner.ppo, rollout, settings, learner.generator,
-                policy_moves=self.updates >= settings.critic_warmup_updates,
-                progress=self.agent_steps["ppo"] / settings.agent_steps, number=self.updates,
-            )  # fmt: skip
-            seconds = {
-                "env": rollout.env_s,
-                "act": collected - began - rollout.env_s,
-                "update": time.monotonic() - collected,
-            }
-            self._after_update(rollout.agent_steps, settings.agent_steps, numbers, seconds, rollout.episodes)
+        with self._rollouts() as source:
+            while self.agent_steps["ppo"] < settings.agent_steps and not self._stop.is_set():
+                began = time.monotonic()
+                rollout = source.collect(learner.actor, learner.generator)
+                collected = time.monotonic()
+                numbers = update(
+                    learner.actor, learner.critic, learner.ppo, rollout, settings, learner.generator,
+                    policy_moves=self.updates >= settings.critic_warmup_updates,
+                    progress=self.agent_steps["ppo"] / settings.agent_steps, number=self.updates,
+                )  # fmt: skip
+                seconds = {
+                    "env": rollout.env_s,
+                    "act": collected - began - rollout.env_s,
+                    "update": time.monotonic() - collected,
+                }
+                self._after_update(rollout.agent_steps, settings.agent_steps, numbers, seconds, rollout.episodes)
+            self._last = self.checkpoint()  # while its workers live
 
     def _after_update(
         self, steps: int, total: int, numbers: dict[str, float], seconds: dict[str, float], episodes: list[Any]
@@ -205,7 +236,7 @@ class Trainer:
         for event in events:
             logger.log(logging.WARNING if event.kind == "given up" else logging.INFO, "%s", event)
         if events:
-            self.env.set_level_weights(self.curriculum.level_weights())
+            (self._source or self.env).set_level_weights(self.curriculum.level_weights())
         report = Report(
             phase=self.phase,
             agent_steps=sum(self.agent_steps.values()),
@@ -238,11 +269,10 @@ class Trainer:
             critic=learner.critic.state_dict(),
             optimisers=learner.optimiser_states(),
             rngs=learner.draws(),
-            env=self.env.state_dict(),
+            env=None if self._source is None else self._source.state_dict(),
             progress={
                 "episodes": self.episodes.state_dict(),
                 "curriculum": self.curriculum.state_dict(),
-                "recall": {"state": self._recall.state.cpu(), "starts": self._recall.starts.cpu()},
             },
             record={**run_record(self.settings), "levels": self.episodes.summary()},
         )

@@ -13,7 +13,15 @@ import pytest
 from imagine.onboard.settings import DEFAULT_POLICY
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = ("core/*.py", "sim/levels/*.yaml", "gcs/web/*", "train/configs/*.yaml", "onboard/policies/*")
+DATA = (
+    "core/*.py",
+    "sim/levels/*.yaml",
+    "gcs/web/*",
+    "train/configs/*.yaml",
+    "train/studies/*.yaml",
+    "train/slurm/*",
+    "onboard/policies/*",
+)
 NOT_BUILT = shutil.ignore_patterns(".*", "build", "runs", "tests", "docs", "__pycache__", "*.egg-info")
 TRY_IT = """
 import sys, urllib.request

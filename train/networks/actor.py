@@ -142,15 +142,20 @@ class Actor(Computing):
             wanted = wanted + nn.functional.pad(steered, (0, self.action_size - steered.shape[1]))
         return Decisions(torch.tanh(wanted), features, state)
 
-    def draw(self, decisions: Decisions, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def noise(self, rows: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        """Return what `draw` needs of chance, `[*rows, taken size]`: the same whoever flies the rows."""
+        size = (*rows, self.taken_size)
+        drawn = torch.randn(size, generator=generator) if self.choice is None else torch.rand(size, generator=generator)
+        return drawn.to(self.device)
+
+    def draw(self, decisions: Decisions, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Return what is done in training, `[rows, taken size]`, and its log density, `[rows]`.
 
-        It is an action, or the number of a frontier; `flown` makes either an action.
+        It is an action, or the number of a frontier; `flown` makes either an action. `noise` is of as many rows.
         """
         if decisions.scores is not None:
-            choice = draw_choice(decisions.scores, generator)
+            choice = draw_choice(decisions.scores, noise.squeeze(1))
             return choice.unsqueeze(1).float(), choice_log_probability(decisions.scores, choice)
-        noise = torch.randn(decisions.mean.shape, generator=generator).to(decisions.mean.device)
         taken = decisions.mean + self.spread().exp() * noise
         return taken, self.log_probability(decisions.mean, None, taken)
 

@@ -43,9 +43,11 @@ def direction_of(frontiers: Tensor, choice: Tensor) -> Tensor:
     return frontiers[..., 1:3].gather(1, at).squeeze(1)
 
 
-def draw_choice(scores: Tensor, generator: torch.Generator) -> Tensor:
-    """Return choices, int64 `[rows]`, drawn by the softmax of scores, on the scores' device."""
-    return torch.multinomial(torch.softmax(scores, dim=1).cpu(), 1, generator=generator).squeeze(1).to(scores.device)
+def draw_choice(scores: Tensor, uniform: Tensor) -> Tensor:
+    """Return choices, int64 `[rows]`, by the softmax of scores, for numbers in [0, 1) `[rows]`."""
+    reached = torch.softmax(scores, dim=1).cumsum(dim=1)
+    below = (reached <= uniform.unsqueeze(1) * reached[:, -1:]).sum(dim=1)
+    return below.clamp(max=scores.shape[1] - 1)
 
 
 def choice_log_probability(scores: Tensor, choice: Tensor) -> Tensor:
