@@ -169,8 +169,9 @@ def collect(
 ) -> tuple[Rollout, Observation]:
     """Act `steps` times by draws from the policy; return the rollout and the observation to go on from.
 
-    `noise`, as `Actor.noise` gives it, is taken instead of draws from `generator`. `recall` is what is remembered so far, and is brought up to date; without one everybody's episode begins. What is
-    learned from together are `sequence_steps` steps, or as many fewer as divide `steps`.
+    `noise`, as `Actor.noise` gives it, is taken instead of draws from `generator`. `recall` is what is remembered so
+    far, and is brought up to date; without one everybody's episode begins. What is learned from together are
+    `sequence_steps` steps, or as many fewer as divide `steps`.
     """
     with at_precision(precision, actor):
         recall = recall or Recall.nothing(actor, env.worlds * env.drones)

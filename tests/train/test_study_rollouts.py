@@ -2,7 +2,6 @@
 
 from importlib.util import find_spec
 
-import numpy as np
 import pytest
 import torch
 
@@ -10,7 +9,7 @@ from imagine.core.errors import InputError
 from imagine.sim.exploration import Exploration
 from imagine.train.learner import Learner
 from imagine.train.ppo import update
-from imagine.train.rollout import collect
+from imagine.train.rollout import Recall, collect
 from imagine.train.rollout_source import OwnRollouts
 from imagine.train.rollout_workers import RolloutWorkerLost, RolloutWorkers, rollout_workers
 from imagine.train.settings import load_train_settings
@@ -77,8 +76,8 @@ def test_workers_fly_what_one_process_flies(flown):
 
 def test_the_workers_states_are_those_of_the_worlds(flown):
     _, state, own, _ = flown
-    ticks = [tick for part in state["workers"] for tick in np.asarray(part["env"]["ticks"]).tolist()]
-    assert ticks == np.asarray(own["env"]["ticks"]).tolist()
+    places = [place for part in state["workers"] for place in part["env"]["poses"][:, 0, 0].tolist()]
+    assert places == own["env"]["poses"][:, 0, 0].tolist()
 
 
 def test_a_worker_s_death_is_told(flown):
