@@ -231,3 +231,13 @@ def test_a_batch_holds_whole_teams_and_whole_sequences_of_the_living(env):
     pieces = cut.shuffled(8, torch.Generator().manual_seed(0))
     seen = [row for units in pieces for row in cut.batch(units)["row"].tolist()]
     assert sorted(seen) == sorted([0, 1, 4, 5, 8, 9, 12, 13, 16, 17, 20, 21, 19])
+
+
+def test_what_is_remembered_can_be_saved(env):
+    actor, _, _, generator = networks(memory="gru")
+    recall = Recall.nothing(actor, AGENTS)
+    rollout, _ = collect(env, env.reset(), actor, 7, generator, recall=recall)
+    assert recall.state.abs().max() > 0.0
+    again = Recall.restored(recall.state_dict(), actor)
+    assert torch.equal(again.state, rollout.recall.state)
+    assert torch.equal(again.starts, rollout.recall.starts)
