@@ -67,15 +67,14 @@ class TrainingBench:
         progress("warm-up")
         rollout = self._collect(_WARM_STEPS)
         self._update(rollout)
-        names = ("training", "rollout", "update", "env", "level_images", "acting", "values")
+        names = ("rollout", "update", "env", "level_images", "acting", "values")
         watches = {name: _Watch() for name in names}
         for number in range(rounds):
             progress(f"round {number + 1} of {rounds}")
-            with watches["training"].running():
-                with watches["rollout"].running():
-                    rollout = self._collect(self.settings.ppo.rollout_steps)
-                with watches["update"].running():
-                    self._update(rollout)
+            with watches["rollout"].running():
+                rollout = self._collect(self.settings.ppo.rollout_steps)
+            with watches["update"].running():
+                self._update(rollout)
             watches["env"].wall_s.append(rollout.env_s)
             self._time_parts(rollout, watches)
         return self._results(rollout, watches)
@@ -110,20 +109,20 @@ class TrainingBench:
 
     def _results(self, rollout: Rollout, watches: dict[str, _Watch]) -> Results:
         per_round = rollout.alive.numel()
-        rates = [per_round / s for s in watches["training"].wall_s]
+        both = (watches["rollout"], watches["update"])
+        rates = [per_round / sum(pair) for pair in zip(*(watch.wall_s for watch in both), strict=True)]
+        cpu_rates = [per_round / sum(pair) for pair in zip(*(watch.cpu_s for watch in both), strict=True)]
         results: Results = {
             "training": {
                 "value": statistics.median(rates), "unit": "agent-steps/s", "low": min(rates), "high": max(rates),
-                "per_cpu_s": statistics.median(per_round / s for s in watches["training"].cpu_s),
+                "per_cpu_s": statistics.median(cpu_rates),
                 "drone_ticks_per_s": statistics.median(rates) * self.settings.env.action.decision_ticks,
                 "rounds": len(rates), "worlds": self.env.worlds, "drones": self.env.drones,
                 "precision": str(compute_dtype(self.settings.ppo.precision, self.actor.device)).removeprefix("torch."),
                 "device": self.actor.device.type, "threads": torch.get_num_threads(),
             }
         }  # fmt: skip
-        for name, watch in watches.items():
-            if name != "training":
-                results[name] = _microseconds(watch, per_round)
+        results |= {name: _microseconds(watch, per_round) for name, watch in watches.items()}
         results["parameters"] = {
             "value": sum(weight.numel() for weight in self.actor.parameters()),
             "critic": sum(weight.numel() for weight in self.critic.parameters()),

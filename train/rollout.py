@@ -38,6 +38,15 @@ class Recall:
             torch.zeros((agents, actor.state_size), device=device), torch.ones(agents, dtype=torch.bool, device=device)
         )
 
+    @staticmethod
+    def restored(state: dict[str, NDArray[Any]], actor: Actor) -> Recall:
+        """Return what `state_dict` gave, where the actor is."""
+        return Recall(*(torch.from_numpy(state[name]).to(actor.device) for name in ("state", "starts")))
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """Return it as arrays, to be saved."""
+        return {"state": self.state.cpu().numpy(), "starts": self.starts.cpu().numpy()}
+
     def copy(self) -> Recall:
         """Return it as it is now."""
         return Recall(self.state.clone(), self.starts.clone())

@@ -11,6 +11,7 @@ import torch
 from imagine.core.observation_spec import ObservationSpec
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
+from imagine.train.baselines import baseline
 from imagine.train.batches import Cut
 from imagine.train.imitation import ImitationSettings, collect_labels, label_buffer, learn
 from imagine.train.networks import Actor, Critic, NetworkSettings, at_precision, log_probability
@@ -56,8 +57,10 @@ def test_every_kind_learns_from_the_planner_and_from_rewards(env, paradigm, memo
     )
     recall = Recall.nothing(actor, AGENTS)
     buffer = label_buffer(actor, 1000)
+    observation, teacher = env.reset(), baseline("frontier", 0)
+    teacher.begin(env)
     observation, _, labels = collect_labels(
-        env, env.reset(), actor, buffer, STEPS, 0.5, np.random.default_rng(0), generator, recall=recall
+        env, observation, actor, teacher, buffer, STEPS, 0.5, np.random.default_rng(0), generator, recall=recall
     )
     assert labels > AGENTS
     untaught = weights_of(actor)
@@ -231,3 +234,13 @@ def test_a_batch_holds_whole_teams_and_whole_sequences_of_the_living(env):
     pieces = cut.shuffled(8, torch.Generator().manual_seed(0))
     seen = [row for units in pieces for row in cut.batch(units)["row"].tolist()]
     assert sorted(seen) == sorted([0, 1, 4, 5, 8, 9, 12, 13, 16, 17, 20, 21, 19])
+
+
+def test_what_is_remembered_can_be_saved(env):
+    actor, _, _, generator = networks(memory="gru")
+    recall = Recall.nothing(actor, AGENTS)
+    rollout, _ = collect(env, env.reset(), actor, 7, generator, recall=recall)
+    assert recall.state.abs().max() > 0.0
+    again = Recall.restored(recall.state_dict(), actor)
+    assert torch.equal(again.state, rollout.recall.state)
+    assert torch.equal(again.starts, rollout.recall.starts)

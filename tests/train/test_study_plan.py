@@ -59,7 +59,7 @@ def test_draws_are_of_the_space_the_same_for_the_same_seed_and_for_all_repeats()
     }
     trials = plan_trials(study(**wanted))
     assert len(trials) == 40
-    rates = np.array([trial.settings.ppo.actor_lr for trial in trials[:20]])
+    rates = np.array([trial.settings.ppo.actor_lr.start for trial in trials[:20]])
     assert ((rates >= 1e-5) & (rates <= 1e-3)).all()
     assert len(set(rates)) == 20
     assert 4 <= (rates < 1e-4).sum() <= 16  # half of a loguniform's draws lie below the geometric middle
