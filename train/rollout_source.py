@@ -48,14 +48,5 @@ class OwnRollouts:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the environment's state, and what drones remember."""
-        return {"env": self._env.state_dict(), "recall": recall_state(self._recall)}
+        return {"env": self._env.state_dict(), "recall": self._recall.state_dict()}
 
-
-def recall_state(recall: Recall) -> dict[str, Any]:
-    """Return what drones remember, as a checkpoint keeps it."""
-    return {"state": recall.state.cpu().numpy(), "starts": recall.starts.cpu().numpy()}
-
-
-def recall_of(state: dict[str, Any], device: torch.device) -> Recall:
-    """Undo `recall_state`."""
-    return Recall(torch.from_numpy(state["state"]).to(device), torch.from_numpy(state["starts"]).to(device))

@@ -24,7 +24,7 @@ from imagine.train.joined_rollouts import joined
 from imagine.train.networks import Actor
 from imagine.train.ppo_settings import PpoSettings
 from imagine.train.rollout import Recall, Rollout
-from imagine.train.rollout_source import OwnRollouts, recall_of
+from imagine.train.rollout_source import OwnRollouts
 from imagine.train.study.cluster import ray_connection
 
 _START_S = 600.0  # the first worker on a machine may have to compile the kernels
@@ -152,7 +152,7 @@ class _Worker:
         if state is None:
             observation = env.reset()
         else:
-            observation, recall = env.load_state_dict(state["env"]), recall_of(state["recall"], actor.device)
+            observation, recall = env.load_state_dict(state["env"]), Recall.restored(state["recall"], actor)
         self._actor, self._source = actor, OwnRollouts(env, observation, recall, ppo)
 
     def ready(self) -> bool:

@@ -29,7 +29,7 @@ from imagine.train.policies import policy_of
 from imagine.train.ppo import update
 from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
 from imagine.train.rollout import Recall
-from imagine.train.rollout_source import OwnRollouts, RolloutSource, recall_of
+from imagine.train.rollout_source import OwnRollouts, RolloutSource
 from imagine.train.run_folder import RunFolder, run_record
 from imagine.train.settings import TrainSettings, load_train_settings
 from imagine.train.stopping import stop_requests
@@ -126,7 +126,7 @@ class Trainer:
             self._observation = self.env.reset()
         else:
             self._observation = self.env.load_state_dict(state["env"])
-            self._recall = recall_of(state["recall"], self.learner.actor.device)
+            self._recall = Recall.restored(state["recall"], self.learner.actor)
 
     def run(self, folder: RunFolder, report: Reporter, stop: threading.Event) -> RunResult:
         """Train until both phases are done or `stop` is set; leave a checkpoint either way.
