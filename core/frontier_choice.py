@@ -24,7 +24,7 @@ FRONTIER_NUMBERS = 14
 """Numbers for each frontier shown, see `fill_frontiers`."""
 _WAY_M, _OFFSET_M, _MOST = 10.0, 10.0, 3.0
 _CLUSTER_CELLS = 6  # 1.2 m
-_NEAR_CELLS, _FAR_CELLS = 20, 40  # what may be seen: at a target, 4 m around it, and where it leads, 8 m
+_NEAR_CELLS, _FAR_CELLS = 20, 30  # what may be seen: at a target, 4 m around it, and where it leads, 6 m
 _COST_PER_M = 0.1  # of the logarithm of what is seen, as the coordinated planner weighs a way
 _STRIDE = 2  # cells between two looks for what a target leads to
 _OWN_RINGS, _PEER_RINGS = 4, 12
@@ -66,7 +66,7 @@ def fill_frontiers(  # type: ignore[no-untyped-def]
     """Fill `frontiers` (float32 `[n, FRONTIER_NUMBERS]`) with the n best targets of a drone at (x, y), best first.
 
     Numbers of each: 1; the direction to fly in, a unit vector; the way there; what it may show within 4 m and within
-    8 m, as shares of these discs; the ways of the nearest two peers; the offset from the drone; whether the dealing
+    6 m, as shares of these discs; the ways of the nearest two peers; the offset from the drone; whether the dealing
     gives it to this drone, to a peer; what it may show once the peers have seen theirs; how fresh the nearest peer's
     report is. Metres are over 10,
     ways at most 3, and 3 where nobody gets there; vectors are along axes turned by `turn`. Rows beyond the targets
