@@ -18,9 +18,10 @@ from imagine.train.study.events import Event
 from imagine.train.study.folder import StudyFolder
 from imagine.train.study.plan import Trial, plan_trials, total_steps
 from imagine.train.study.plot import plot_summary
-from imagine.train.study.results import METRICS, study_data, write_results
+from imagine.train.study.results import study_data, write_results
 from imagine.train.study.run import run_study
 from imagine.train.study.settings import STUDIES, StudySettings, load_study_settings
+from imagine.train.study.trial import METRICS
 
 _MOST_ROWS = 40
 _TELL_EVERY_S = 30.0

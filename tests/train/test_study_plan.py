@@ -125,7 +125,7 @@ def test_a_wrong_study_is_refused_with_file_and_key(tmp_path, text, message):
 def test_numbers_in_scientific_notation_are_numbers(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("name: s\nbase: smoke\nparameters: {grid: {ppo.actor_lr: [1e-4, 3e-4]}}\n")
-    assert [t.settings.ppo.actor_lr for t in plan_trials(load_study_settings(path))] == [1e-4, 3e-4]
+    assert [t.settings.ppo.actor_lr.start for t in plan_trials(load_study_settings(path))] == [1e-4, 3e-4]
 
 
 def test_a_base_beside_the_study_is_taken(tmp_path):

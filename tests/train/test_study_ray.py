@@ -1,5 +1,6 @@
 """Studies on a real Ray of two CPUs: a worker is killed, the study is interrupted, and nothing is lost."""
 
+import json
 import os
 import signal
 import socket
@@ -17,7 +18,7 @@ from imagine.cli import main
 from imagine.core.errors import InputError
 from imagine.train.checkpoint import load_checkpoint
 from imagine.train.study import cluster
-from imagine.train.study.outcome import read_attempts, read_metrics
+from imagine.train.study.outcome import read_attempts
 from imagine.train.study.results import study_data
 from imagine.train.study.run import run_study
 from imagine.train.study.settings import StudySettings
@@ -134,7 +135,7 @@ def test_the_killed_worker_s_trial_was_resumed_by_another_and_not_restarted(stor
     by_second = [steps for pid, steps in reports if pid == after.pid]
     assert min(by_second) > after.resumed_from  # it did not do again what the checkpoint held
     assert max(by_second) == 384
-    steps = [row["agent_steps"] for row in read_metrics(run)]
+    steps = [json.loads(line)["agent_steps"] for line in (run / "metrics.jsonl").read_text("utf-8").splitlines()]
     assert steps == sorted(set(steps))
     assert steps[0] <= after.resumed_from  # the first worker's metrics are kept
     assert steps[-1] == 384

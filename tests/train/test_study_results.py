@@ -95,7 +95,7 @@ def test_outcomes_and_attempts_survive_the_disk_and_half_a_line(tmp_path):
 
 def test_a_finished_trial_is_told_by_its_evaluation_and_a_cut_one_by_its_training(tmp_path):
     row = {"agent_steps": 640, "wall_s": 2.0, "levels": {"4": {"coverage": 0.5, "t90": 900.0, "contacts": 0.0}}}
-    (tmp_path / "metrics.jsonl").write_text(json.dumps(row) + "\n" + '{"agent_st')
+    (tmp_path / "reports.jsonl").write_text(json.dumps(row) + "\n" + '{"agent_st')
     rows = [{"level": "4", "coverage_mean": 0.99, "t90_mean": 321.0, "collisions_per_episode": 0.5}]
     (tmp_path / "evaluation.json").write_text(json.dumps({"rows": rows}))
     finished, cut = outcome_of(tmp_path, "finished"), outcome_of(tmp_path, "time limit")

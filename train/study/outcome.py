@@ -1,6 +1,7 @@
 """What a trial leaves in its run folder beside what every run leaves there.
 
 attempts.jsonl   one line for every worker that took the trial up: process, host, the agent-steps it went on from
+reports.jsonl    one line for every update: agent-steps, seconds, and coverage, t90 and contacts by level
 outcome.json     how the trial ended; without it, it has not ended
 error.txt        the traceback of the newest failure
 """
@@ -69,36 +70,55 @@ def read_outcome(folder: Path) -> Outcome | None:
 
 def log_attempt(folder: Path, resumed_from: int) -> None:
     """Note that this process takes the trial up. Raises WorkError where the folder cannot be written."""
-    attempt = Attempt(os.getpid(), socket.gethostname(), resumed_from)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "attempts.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(asdict(attempt)) + "\n")
-    except OSError as error:
-        raise write_failure(folder / "attempts.jsonl", error) from error
+    _append(folder / "attempts.jsonl", asdict(Attempt(os.getpid(), socket.gethostname(), resumed_from)))
 
 
 def read_attempts(folder: Path) -> list[Attempt]:
-    """Return who took the trial up so far; a line cut short by a crash is left out."""
-    path = folder / "attempts.jsonl"
-    attempts = []
-    for line in path.read_text("utf-8").splitlines() if path.exists() else ():
-        try:
-            attempts.append(Attempt(**json.loads(line)))
-        except (ValueError, TypeError):
-            continue
-    return attempts
+    """Return who took the trial up so far."""
+    return [Attempt(**line) for line in _lines(folder / "attempts.jsonl")]
 
 
-def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of a run's metrics, oldest first; a line cut short by a crash is left out."""
-    path = folder / "metrics.jsonl"
-    rows = []
+@dataclass(frozen=True)
+class Told:
+    """What a trial reported of an update; `levels` as of `Outcome`."""
+
+    agent_steps: int
+    wall_s: float
+    levels: dict[str, dict[str, float]]
+
+
+def log_told(folder: Path, told: Told) -> None:
+    """Keep what is reported. Raises WorkError where the folder cannot be written."""
+    _append(folder / "reports.jsonl", asdict(told))
+
+
+def read_told(folder: Path, until: int | None = None) -> list[Told]:
+    """Return what was reported, oldest first; of a run that goes on after `until` agent-steps, what led there."""
+    told = [Told(**line) for line in _lines(folder / "reports.jsonl")]
+    return told if until is None else [one for one in told if one.agent_steps <= until]
+
+
+def rewrite_told(folder: Path, told: list[Told]) -> None:
+    """Keep these reports alone. Raises WorkError where the folder cannot be written."""
+    text = "".join(json.dumps(asdict(one)) + "\n" for one in told)
+    write_atomically(folder / "reports.jsonl", lambda file: file.write_text(text, encoding="utf-8"))
+
+
+def _append(path: Path, record: dict[str, Any]) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record) + "\n")
+    except OSError as error:
+        raise write_failure(path, error) from error
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    """Return the records of a file of lines; one cut short by a crash is left out."""
+    records = []
     for line in path.read_text("utf-8").splitlines() if path.exists() else ():
         try:
-            row = json.loads(line)
+            records.append(json.loads(line))
         except ValueError:
             continue
-        if isinstance(row, dict):
-            rows.append(row)
-    return rows
+    return records

@@ -17,9 +17,7 @@ from imagine.train.atomic_file import write_atomically
 from imagine.train.study.outcome import read_attempts
 from imagine.train.study.run import StudyResult
 from imagine.train.study.settings import StudySettings
-from imagine.train.study.trial import mean_over_levels
-
-METRICS = ("coverage", "t90", "contacts")
+from imagine.train.study.trial import METRICS, mean_over_levels
 
 
 def trial_rows(result: StudyResult) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,27 @@ from imagine.core.errors import ImagineError, InputError
 from imagine.train.atomic_file import write_atomically
 from imagine.train.checkpoint import load_checkpoint
 from imagine.train.report import Report
+<<<<<<< HEAD
 from imagine.train.rollout_workers import RolloutWorkerLost
 from imagine.train.study.outcome import Outcome, log_attempt, read_metrics, read_outcome, write_outcome
+=======
+from imagine.train.study.outcome import (
+    Outcome,
+    Status,
+    Told,
+    log_attempt,
+    log_told,
+    read_outcome,
+    read_told,
+    rewrite_told,
+    write_outcome,
+)
+from imagine.train.study.rollout_workers import RolloutWorkerLost
+>>>>>>> study
 from imagine.train.trainer import train
+
+METRICS = ("coverage", "t90", "contacts")
+"""What trials are compared by: of episodes, means by level."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +79,12 @@ def run_trial(config: dict[str, Any]) -> None:
     if Path(task.here).is_dir():
         os.chdir(task.here)
     os.environ["IMAGINE_THREADS"] = str(task.cpus)
-    reporter = _TuneReporter(task)
+    reporter = _TuneReporter(task, folder)
     try:
         with Watchdog(task.silent_s, folder / "error.txt") as reporter.watchdog:
             if _ended(folder):
                 if task.retell:
-                    reporter.retell(read_metrics(folder))
+                    reporter.retell(read_told(folder))
                 return
             status = _train(task, folder, reporter)
             write_outcome(folder, outcome_of(folder, status))
@@ -85,15 +103,17 @@ def _ended(folder: Path) -> bool:
     return outcome is not None and outcome.ended
 
 
-def _train(task: Task, folder: Path, reporter: _TuneReporter) -> Any:
+def _train(task: Task, folder: Path, reporter: _TuneReporter) -> Status:
     """Train and return the status to end with."""
     latest = folder / "checkpoints" / "latest.pt"
     try:
         if latest.exists():
             steps = sum(load_checkpoint(latest).agent_steps.values())
             log_attempt(folder, steps)
+            told = read_told(folder, until=steps)
+            rewrite_told(folder, told)
             if task.retell:
-                reporter.retell([row for row in read_metrics(folder) if row["agent_steps"] <= steps])
+                reporter.retell(told)
             train(None, resume=folder, report=reporter)
         else:
             _clear(folder)
@@ -113,16 +133,15 @@ def _clear(folder: Path) -> None:
             path.unlink()
 
 
-def outcome_of(folder: Path, status: Any, error: str = "") -> Outcome:
-    """Return how a trial stands by what lies in its run folder: its final evaluation, or else its newest metrics."""
-    rows = read_metrics(folder)
-    last: Mapping[str, Any] = rows[-1] if rows else {}
+def outcome_of(folder: Path, status: Status, error: str = "") -> Outcome:
+    """Return how a trial stands by what lies in its run folder: its final evaluation, or else its newest reports."""
+    told = read_told(folder)
     evaluated = _evaluated(folder) if status == "finished" else {}
-    trained: dict[str, dict[str, float]] = next((row["levels"] for row in reversed(rows) if row.get("levels")), {})
+    trained: dict[str, dict[str, float]] = next((one.levels for one in reversed(told) if one.levels), {})
     return Outcome(
         status=status,
-        agent_steps=int(last.get("agent_steps", 0)),
-        wall_s=float(last.get("wall_s", 0.0)),
+        agent_steps=told[-1].agent_steps if told else 0,
+        wall_s=told[-1].wall_s if told else 0.0,
         levels=evaluated or trained,
         source="evaluation" if evaluated else "training",
         error=error,
@@ -153,29 +172,32 @@ def _write_error(folder: Path) -> None:
 class _TuneReporter:
     """Tells Tune of every update, feeds the watchdog, and ends the trial when its time is up."""
 
-    def __init__(self, task: Task) -> None:
-        self._limit_s = task.time_limit_s
+    def __init__(self, task: Task, folder: Path) -> None:
+        self._limit_s, self._folder = task.time_limit_s, folder
         self.watchdog: Watchdog | None = None
 
     def __call__(self, report: Report) -> None:
         """Take one report. Tune ends the thread in here (SystemExit) when it stops the trial."""
-        self._tell(report.agent_steps, report.wall_s, report.levels)
+        levels = {level: {name: numbers[name] for name in METRICS} for level, numbers in report.levels.items()}
+        told = Told(report.agent_steps, report.wall_s, levels)
+        log_told(self._folder, told)
+        self._tell(told)
         if self._limit_s is not None and report.wall_s >= self._limit_s:
             raise _TimeIsUp
 
-    def retell(self, rows: list[dict[str, Any]]) -> None:
-        """Tell Tune what rows of metrics say."""
-        for row in rows:
-            self._tell(row["agent_steps"], row["wall_s"], row["levels"])
+    def retell(self, told: Sequence[Told]) -> None:
+        """Tell Tune again what it was told."""
+        for one in told:
+            self._tell(one)
 
-    def _tell(self, agent_steps: int, wall_s: float, levels: Mapping[str, Mapping[str, float]]) -> None:
+    def _tell(self, told: Told) -> None:
         from ray import tune
 
         if self.watchdog is not None:
             self.watchdog.feed()
-        means = {name: mean_over_levels(levels, name) for name in ("coverage", "t90", "contacts")}
+        means = {name: mean_over_levels(told.levels, name) for name in METRICS}
         known = {name: value for name, value in means.items() if not math.isnan(value)}  # ASHA passes over the rest
-        tune.report({"agent_steps": agent_steps, "train_s": wall_s, **known})
+        tune.report({"agent_steps": told.agent_steps, "train_s": told.wall_s, **known})
 
 
 class Watchdog:
