@@ -49,4 +49,3 @@ class OwnRollouts:
     def state_dict(self) -> dict[str, Any]:
         """Return the environment's state, and what drones remember."""
         return {"env": self._env.state_dict(), "recall": self._recall.state_dict()}
-

@@ -21,10 +21,7 @@ from imagine.core.errors import ImagineError, InputError
 from imagine.train.atomic_file import write_atomically
 from imagine.train.checkpoint import load_checkpoint
 from imagine.train.report import Report
-<<<<<<< HEAD
 from imagine.train.rollout_workers import RolloutWorkerLost
-from imagine.train.study.outcome import Outcome, log_attempt, read_metrics, read_outcome, write_outcome
-=======
 from imagine.train.study.outcome import (
     Outcome,
     Status,
@@ -36,8 +33,6 @@ from imagine.train.study.outcome import (
     rewrite_told,
     write_outcome,
 )
-from imagine.train.study.rollout_workers import RolloutWorkerLost
->>>>>>> study
 from imagine.train.trainer import train
 
 METRICS = ("coverage", "t90", "contacts")
