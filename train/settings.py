@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from imagine.core.config import Settings, load_settings
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.curriculum_settings import CurriculumSettings
 from imagine.train.imitation import ImitationSettings
-from imagine.train.networks import DeviceName, NetworkSettings
+from imagine.train.networks import DeviceName, NetworkSettings, steers
 from imagine.train.ppo_settings import PpoSettings
 from imagine.train.tracking.settings import TrackingSettings
 
@@ -42,6 +43,16 @@ class TrainSettings(Settings):
     imitation: ImitationSettings = Field(default_factory=ImitationSettings)
     ppo: PpoSettings = Field(default_factory=PpoSettings)
     tracking: TrackingSettings = Field(default_factory=TrackingSettings)
+
+    @model_validator(mode="after")
+    def _choice_has_choices(self) -> Self:
+        observation, action = self.env.observation, self.env.action
+        if self.network.head == "choice" and not (observation.frontiers and steers(observation, action)):
+            raise ValueError(
+                "network.head choice needs env.observation.frontiers above 0, and actions that are a direction along "
+                "the observation's axes: env.action.mode plane or waypoint; else take network.head gaussian"
+            )
+        return self
 
 
 def load_train_settings(config: Path | None, overrides: tuple[str, ...] = ()) -> TrainSettings:
