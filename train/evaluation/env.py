@@ -19,6 +19,7 @@ _EVALUATED = {
     "stagger": "episodes are flown whole",
 }  # fmt: skip
 """Settings that an evaluation decides itself, and what to do or know instead."""
+_STOP_COVERAGE = ExplorationSettings().stop_coverage  # episodes of a training may end sooner
 _PART_OF_THE_POLICY = ("observation", "action")
 _PART_OF_THE_DRONE = ("map", "limits", "lidar", "lidar_beams")
 
@@ -35,7 +36,8 @@ def evaluation_env(contender: Contender, overrides: Sequence[str] = ()) -> Explo
     Raises InputError on an unknown key, with the nearest right one; on a setting that the evaluation decides itself;
     and where a policy would get other observations, or other meanings of its actions, than those it was made for.
     """
-    base = EvaluationSettings(env=contender.env or ExplorationSettings())
+    made_for = contender.env or ExplorationSettings()
+    base = EvaluationSettings(env=made_for.model_copy(update={"stop_coverage": _STOP_COVERAGE}))
     changed = check_settings(EvaluationSettings, apply_overrides(base.model_dump(), overrides), "--set").env
     for override in overrides:
         group, _, key = override.partition("=")[0].strip().partition(".")
