@@ -17,7 +17,15 @@ from imagine.core.dealing import deal, worth_of
 from imagine.core.frontier import PAD, PLAN_CELL, UNIT_M
 from imagine.core.frontier_gaps import fill_flyable
 from imagine.core.frontier_paths import FAR, search_scratch
-from imagine.core.frontier_targets import MOST_TARGETS, expected_gain, fill_ways, find_targets, gain_rays, nearest_open
+from imagine.core.frontier_targets import (
+    MOST_TARGETS,
+    expected_gain,
+    fill_ways,
+    find_targets,
+    gain_canvas,
+    gain_rays,
+    nearest_open,
+)
 from imagine.core.frontier_ways import follow, trace_back
 
 FRONTIER_NUMBERS = 14
@@ -54,7 +62,7 @@ def choice_scratch(rows: int, columns: int) -> ChoiceScratch:
         np.empty((rows, columns), np.uint8), np.empty((rows, columns), np.int16), np.empty((rows, columns), np.int16),
         np.zeros(cells, np.uint8),
         np.empty(cells, np.int32), search_scratch(cells), np.empty(MOST_TARGETS, np.int32),
-        np.empty(_PATH_CELLS, np.int32), np.empty((rows, columns), np.float32), gain_rays(),
+        np.empty(_PATH_CELLS, np.int32), gain_canvas(rows, columns), gain_rays(),
         np.full(1, -1, np.int32),
     )  # fmt: skip
 

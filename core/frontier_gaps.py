@@ -37,10 +37,9 @@ def fill_flyable(out, kinds, states, belief):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _is_gap(belief, row, column):  # type: ignore[no-untyped-def]
     """Tell whether no obstacle lies in the four by four map cells around the planning cell that begins here."""
-    if row < 1 or column < 1 or row + 3 > belief.shape[0] or column + 3 > belief.shape[1]:
-        return False
-    for i in range(row - 1, row + 3):
-        for j in range(column - 1, column + 3):
+    rows, columns = belief.shape
+    for i in range(max(0, row - 1), min(rows, row + 3)):
+        for j in range(max(0, column - 1), min(columns, column + 3)):
             if belief[i, j] > 0:
                 return False
     return True

@@ -17,6 +17,8 @@ from imagine.core.frontier_paths import BLOCKED, FAR, FRONTIER, OPEN, settle
 MOST_TARGETS = 96
 """Clusters that are considered; what lies beyond, in the order of the grid, waits until others are gone."""
 GAIN_RAYS = 64
+GAIN_MARGIN = 40
+"""Cells around a grid that gain reaches into at most."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -89,10 +91,10 @@ def find_targets(targets, kinds, cost, banned, radius, marks, queue):  # type: i
                             marks[other] = 1
                             queue[listed] = other
                             listed += 1
-            mean_row, mean_column = sum_row / (listed - first), sum_column / (listed - first)
-            best, best_square = queue[first], 1e18
-            for k in range(first, listed):
-                d_row, d_column = queue[k] // columns - mean_row, queue[k] % columns - mean_column
+            best, best_square, size = queue[first], np.int64(1) << 62, listed - first
+            for k in range(first, listed):  # in whole numbers: a tie must not hang on where the grid begins
+                d_row = size * (queue[k] // columns) - sum_row
+                d_column = size * (queue[k] % columns) - sum_column
                 square = d_row * d_row + d_column * d_column
                 if square < best_square:
                     best, best_square = queue[k], square
@@ -118,12 +120,18 @@ def gain_rays(count: int = GAIN_RAYS) -> NDArray[np.float64]:
     return np.column_stack((np.sin(bearing), np.cos(bearing)))
 
 
+def gain_canvas(rows: int, columns: int) -> NDArray[np.float32]:
+    """Return a canvas for how much of each cell nobody else is taken to see, GAIN_MARGIN wider than the padded grid."""
+    return np.ones((rows + 2 * GAIN_MARGIN, columns + 2 * GAIN_MARGIN), np.float32)
+
+
 @numba.njit(cache=True, nogil=True)
 def expected_gain(states, left, cell, reach, rays, stride=1):  # type: ignore[no-untyped-def]
     """Return the unknown share of the disc of `reach` planning cells around a flat cell that no obstacle hides.
 
-    Every `stride`-th cell of a ray is looked at. `left` float32 is how much of each cell nobody else is taken to see.
-    What is unknown hides nothing: an upper bound, as for a next best view (Gonzalez-Banos and Latombe 2002).
+    Every `stride`-th cell of a ray is looked at. `left` is a `gain_canvas`. What is unknown hides nothing: an upper
+    bound, as for a next best view (Gonzalez-Banos and Latombe 2002). Beyond the grid all is unknown, so that it does
+    not matter how much of the world a grid holds.
     """
     rows, columns = states.shape
     row0, column0 = cell // columns + 0.5, cell % columns + 0.5
@@ -132,12 +140,12 @@ def expected_gain(states, left, cell, reach, rays, stride=1):  # type: ignore[no
         total += step
     for ray in range(rays.shape[0]):
         for step in range(stride, reach + 1, stride):
-            row, column = row0 + step * rays[ray, 0], column0 + step * rays[ray, 1]
-            i, j = int(row), int(column)
-            if row < 0.0 or i >= rows or column < 0.0 or j >= columns or states[i, j] == OCCUPIED:
+            i, j = math.floor(row0 + step * rays[ray, 0]), math.floor(column0 + step * rays[ray, 1])
+            state = states[i, j] if 0 <= i < rows and 0 <= j < columns else UNKNOWN
+            if state == OCCUPIED:
                 break
-            if states[i, j] == UNKNOWN:
-                unknown += step * left[i, j]
+            if state == UNKNOWN:
+                unknown += step * left[i + GAIN_MARGIN, j + GAIN_MARGIN]
     return unknown / (rays.shape[0] * total)
 
 
@@ -148,11 +156,11 @@ def claim(left, states, cell, reach, rays, share):  # type: ignore[no-untyped-de
     row0, column0 = cell // columns + 0.5, cell % columns + 0.5
     for ray in range(rays.shape[0]):
         for step in range(reach):
-            row, column = row0 + step * rays[ray, 0], column0 + step * rays[ray, 1]
-            i, j = int(row), int(column)
-            if row < 0.0 or i >= rows or column < 0.0 or j >= columns or states[i, j] == OCCUPIED:
+            i, j = math.floor(row0 + step * rays[ray, 0]), math.floor(column0 + step * rays[ray, 1])
+            if 0 <= i < rows and 0 <= j < columns and states[i, j] == OCCUPIED:
                 break
-            left[i, j] = min(left[i, j], np.float32(1.0 - share * (1.0 - step / reach)))
+            at, kept = (i + GAIN_MARGIN, j + GAIN_MARGIN), np.float32(1.0 - share * (1.0 - step / reach))
+            left[at] = min(left[at], kept)
 
 
 @numba.njit(cache=True, nogil=True)

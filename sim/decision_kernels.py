@@ -110,11 +110,11 @@ def fill_frontier_choices(  # type: ignore[no-untyped-def]
     alive,
     scratch,
 ):
-    """Fill `frontiers` (float32 `[world, drone, n, numbers]`) with what the living can choose from."""
+    """Fill `frontiers` (float32 `[world, drone, n, numbers]`) with what drones can choose from in the worlds `shown`."""
     for world in range(first, last):
+        if not shown[world]:
+            continue
         for drone in range(frontiers.shape[1]):
-            if not alive[world, drone]:
-                continue
             x, y, yaw = poses[world, drone]
             fill_frontiers(
                 frontiers[world, drone], kinds[world, drone], states[world, drone], belief[world, drone],

@@ -127,7 +127,6 @@ class DecisionState:
         belief: NDArray[np.int8],
         poses: NDArray[np.float64],
         origins: NDArray[np.int64],
-        alive: NDArray[np.bool_],
         shown: NDArray[np.bool_],
     ) -> None:
         """Fill what drones can choose from, `[worlds, drones, n, numbers]`, in the `shown` worlds (`[worlds]`).
@@ -138,7 +137,7 @@ class DecisionState:
         spec = self._spec
         self._workers.over(
             len(poses), fill_frontier_choices, frontiers, kinds, states, belief, origins, poses, self.positions,
-            self.ages, spec.peer_memory_s, spec.axes == "heading", alive & shown[:, None], scratch=self._choice_scratch,
+            self.ages, spec.peer_memory_s, spec.axes == "heading", shown, scratch=self._choice_scratch,
         )  # fmt: skip
 
     def decide(self, actions: NDArray[np.float32], poses: NDArray[np.float64]) -> None:

@@ -302,7 +302,7 @@ class Exploration:
             if self.settings.observation.frontiers:
                 self.decisions.fill_frontiers(
                     seen["frontiers"], maps.kinds, maps.states, maps.belief, self.estimates, self.maps.origins,
-                    self.alive, shown != WAITING,
+                    shown != WAITING,
                 )  # fmt: skip
 
     def time_stages(self) -> None:

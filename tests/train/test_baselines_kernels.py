@@ -16,10 +16,12 @@ from imagine.core.frontier import FREE, OCCUPIED, PAD, UNKNOWN, refresh_kinds, r
 from imagine.core.frontier_gaps import fill_flyable
 from imagine.core.frontier_paths import BLOCKED, FAR, FRONTIER, NEAR, OPEN, search_scratch
 from imagine.core.frontier_targets import (
+    GAIN_MARGIN,
     claim,
     expected_gain,
     fill_ways,
     find_targets,
+    gain_canvas,
     gain_rays,
     nearest_open,
 )
@@ -133,16 +135,17 @@ def test_every_frontier_in_reach_belongs_to_a_target(seed: int) -> None:
 def plain_gain(states: NDArray[np.uint8], left: NDArray[np.float64], cell: int, reach: int) -> float:
     """Gain by stepping along every ray, point by point."""
     row0, column0 = cell // states.shape[1] + 0.5, cell % states.shape[1] + 0.5
+    wide = np.pad(states, GAIN_MARGIN, constant_values=UNKNOWN)  # of what lies beyond, nothing is known
     total, unknown = 0.0, 0.0
     for d_row, d_column in RAYS:
         hidden = False
         for step in range(1, reach + 1):
             total += step
             row, column = math.floor(row0 + step * d_row), math.floor(column0 + step * d_column)
-            inside = 0 <= row < states.shape[0] and 0 <= column < states.shape[1]
-            hidden = hidden or not inside or states[row, column] == OCCUPIED
-            if not hidden and states[row, column] == UNKNOWN:
-                unknown += step * left[row, column]
+            at = row + GAIN_MARGIN, column + GAIN_MARGIN
+            hidden = hidden or bool(wide[at] == OCCUPIED)
+            if not hidden and wide[at] == UNKNOWN:
+                unknown += step * left[at]
     return unknown / total
 
 
@@ -151,7 +154,7 @@ def test_gain_counts_the_unknown_that_nothing_hides() -> None:
     inner = np.full((60, 60), FREE, np.uint8)
     inner[:, 30:] = UNKNOWN
     states, _ = grid(inner)
-    cell, everything = (30 + PAD) * states.shape[1] + 29 + PAD, np.ones(states.shape, np.float32)
+    cell, everything = (30 + PAD) * states.shape[1] + 29 + PAD, gain_canvas(*states.shape)
     assert expected_gain(states, everything, cell, 20, RAYS) == pytest.approx(0.5, abs=0.03)
     assert expected_gain(states, 0.5 * everything, cell, 20, RAYS) == pytest.approx(0.25, abs=0.02)
     inner[:, 35] = OCCUPIED
@@ -170,7 +173,7 @@ def deal(
     share: float,
 ) -> int:
     """Deal with utilities as the survey makes them; return the target of robot 0."""
-    left = np.ones(states.shape, np.float32)
+    left = gain_canvas(*states.shape)
     utility = np.array([expected_gain(states, left, target, REACH, RAYS) for target in targets])
     options = (weight, form, 1.0, REACH, share)
     return int(coordinated_target(ways, utility, targets, states, len(ways), len(targets), left, RAYS, options))
@@ -180,7 +183,7 @@ def plain_deal(
     states: NDArray[np.uint8], targets: NDArray[np.int32], ways: NDArray[np.float64], weight: float, share: float
 ) -> int:
     """Burgard et al. (2005), algorithm 1: the target of robot 0."""
-    left, waiting, taken = np.ones(states.shape), set(range(len(ways))), set[int]()
+    left, waiting, taken = np.float64(gain_canvas(*states.shape)), set(range(len(ways))), set[int]()
     while True:
         gains = [plain_gain(states, left, t, REACH) * (k not in taken) for k, t in enumerate(targets)]
         _, minus_t, minus_r = max(
@@ -198,9 +201,10 @@ def plain_deal(
             for step in range(REACH):
                 row, column = math.floor(row0 + step * d_row), math.floor(column0 + step * d_column)
                 inside = 0 <= row < states.shape[0] and 0 <= column < states.shape[1]
-                if not inside or states[row, column] == OCCUPIED:
+                if inside and states[row, column] == OCCUPIED:
                     break
-                left[row, column] = min(left[row, column], 1.0 - share * (1.0 - step / REACH))
+                at = row + GAIN_MARGIN, column + GAIN_MARGIN
+                left[at] = min(left[at], 1.0 - share * (1.0 - step / REACH))
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.7, 1.0]))
@@ -239,7 +243,7 @@ def test_what_a_peer_will_see_is_left_to_it_unless_a_wall_is_between() -> None:
     columns = walled.shape[1]
     first, second = (14 + PAD) * columns + 18 + PAD, (14 + PAD) * columns + 22 + PAD
     for states, least, most in ((open_states, 0.5, 0.8), (walled, 1.0, 1.0)):
-        left = np.ones(states.shape, np.float32)
+        left = gain_canvas(*states.shape)
         before = expected_gain(states, left, second, REACH, RAYS)
         claim(left, states, first, REACH, RAYS, 1.0)
         assert least <= expected_gain(states, left, second, REACH, RAYS) / before <= most

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.frontier_paths import search_scratch
-from imagine.core.frontier_targets import MOST_TARGETS
+from imagine.core.frontier_targets import MOST_TARGETS, gain_canvas
 
 PATH_CELLS = 512
 """Cells of a way that are kept: the next hundred metres."""
@@ -92,6 +92,6 @@ def plan_scratch(rows: int, columns: int) -> PlanScratch:
     """Return scratch for padded planning grids of this size."""
     cells = rows * columns
     return PlanScratch(
-        np.empty((rows, columns), np.int16), np.ones((rows, columns), np.float32), np.zeros(cells, np.uint8),
+        np.empty((rows, columns), np.int16), gain_canvas(rows, columns), np.zeros(cells, np.uint8),
         np.empty(cells, np.int32), search_scratch(cells),
     )  # fmt: skip
