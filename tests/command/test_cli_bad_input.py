@@ -180,7 +180,7 @@ def test_a_malformed_twin_is_named_by_file_line_and_nearest_key(tmp_path: Path) 
     path.write_text("dynamics:\n  lag_s: 0.2\n  winds_mps: 0.1\n")
     refused([*HEADLESS, "--twin", path], r"twin\.yaml:3: unknown key 'dynamics\.winds_mps'; did you mean 'wind_mps'")
     path.write_text("radio:\n  loss: 1.5\n")
-    refused(["sim", "--twin", path], r"twin\.yaml:2: radio\.loss", "less than or equal to 1")
+    refused(["sim", "--twin", path], r"twin\.yaml:2: radio\.loss", "within 0 and 1")
 
 
 def test_models_that_cannot_fly_are_refused(tmp_path: Path) -> None:

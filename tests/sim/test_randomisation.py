@@ -92,7 +92,7 @@ def test_without_ranges_nothing_is_drawn() -> None:
     one, other = environment(plain), environment(fixed)
     for a, b in zip(drawn(one), drawn(other), strict=True):
         np.testing.assert_array_equal(a, b)
-    states = [env.state_dict()["generators"] for env in (one, other)]
+    states = [[g.bit_generator.state for g in env._episodes.generators] for env in (one, other)]
     assert states[0] == states[1]
 
 

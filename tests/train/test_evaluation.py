@@ -223,7 +223,7 @@ def test_all_fly_the_environment_of_the_first_network_each_with_its_own_eyes():
     envs = shared_envs([contender_of("frontier"), network("a", first), network("b", second)], ["env.stop_coverage=0.9"])
     assert [env.episode_ticks for env in envs] == [70, 70, 70]
     assert [env.stop_coverage for env in envs] == [0.9, 0.9, 0.9]
-    assert [env.observation.view_cells for env in envs] == [16, 16, 24]
+    assert [env.observation.view_cells for env in envs] == [32, 16, 24]  # planners need none, and get the default
 
 
 def test_networks_for_different_sensors_are_not_compared():
