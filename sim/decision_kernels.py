@@ -107,10 +107,10 @@ def fill_frontier_choices(  # type: ignore[no-untyped-def]
     ages,
     memory_s,
     heading_axes,
-    alive,
+    shown,
     scratch,
 ):
-    """Fill `frontiers` (float32 `[world, drone, n, numbers]`) with what drones can choose from in the worlds `shown`."""
+    """Fill `frontiers` (float32 `[world, drone, n, numbers]`) with what drones can choose from in `shown` worlds."""
     for world in range(first, last):
         if not shown[world]:
             continue
