@@ -14,7 +14,7 @@ from imagine.core.vehicle_limits import VehicleLimits
 from imagine.mesh_comm.settings import MeshSettings
 from imagine.onboard.odometry_settings import OdometrySettings
 
-DEFAULT_POLICY = Path(__file__).parent / "policies" / "explore.onnx"
+DEFAULT_POLICY = Path(__file__).parent / "policies" / "default.onnx"
 """The policy that is shipped with the project."""
 
 
