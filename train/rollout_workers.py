@@ -7,6 +7,7 @@ for a rollout: how many workers share the worlds changes only how sums over a ba
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import os
 import sys
@@ -153,16 +154,21 @@ class _Worker:
             observation = env.reset()
         else:
             observation, recall = env.load_state_dict(state["env"]), Recall.restored(state["recall"], actor)
-        self._actor, self._source = actor, OwnRollouts(env, observation, recall, ppo)
+        self._actor, self._source, self._keys = actor, OwnRollouts(env, observation, recall, ppo), list(keys)
 
     def ready(self) -> bool:
         """Answer, once everything is loaded."""
         return True
 
     def collect(self, weights: dict[str, Tensor], noise: Tensor) -> Rollout:
-        """Fly as many steps as there is noise for, `[steps, agents, taken size]`."""
+        """Fly as many steps as there is noise for, `[steps, agents, taken size]`; episodes name worlds by their keys.
+
+        Places would not tell the worlds of several workers apart, which all have the same seed.
+        """
         self._actor.load_state_dict(weights)
-        return self._source.collect(self._actor, torch.Generator(), noise)
+        rollout = self._source.collect(self._actor, torch.Generator(), noise)
+        episodes = [dataclasses.replace(episode, world=self._keys[episode.world]) for episode in rollout.episodes]
+        return dataclasses.replace(rollout, episodes=episodes)
 
     def set_level_weights(self, weights: list[float]) -> None:
         """Draw the levels of coming episodes by these shares."""
