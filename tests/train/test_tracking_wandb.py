@@ -2,9 +2,9 @@
 
 import logging
 import socket
+import sys
 import threading
 import time
-import sys
 
 import pytest
 
