@@ -12,6 +12,7 @@ from imagine.core.errors import InputError
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.baselines import BASELINES, baseline
+from imagine.train.baselines.parameters import COORDINATED
 from imagine.train.baselines.pilot import FrontierPilot
 
 PLANNERS = ["frontier", "coordinated", "hungarian"]
@@ -109,6 +110,22 @@ def test_advice_points_along_the_action_of_every_mode() -> None:
         courses.append(course / np.linalg.norm(course, axis=-1, keepdims=True))
     np.testing.assert_allclose(courses[1], courses[0], atol=1e-5)
     np.testing.assert_allclose(courses[2], courses[0], atol=1e-5)
+
+
+def test_without_radio_peers_make_no_difference() -> None:
+    """Under `off` a drone decides as if it were alone; else, from one launch, peers do count."""
+    for protocol, alike in (("off", True), ("one-hop", False)):
+        env = explored("6", protocol=protocol)
+        team, loner = coordinated(), FrontierPilot("loner", COORDINATED._replace(peer_age_s=-1.0))
+        observation = env.reset()
+        team.begin(env)
+        loner.begin(env)
+        same = True
+        for _ in range(20):
+            advice = team.act(env, observation)
+            same = same and np.array_equal(advice, loner.act(env, observation), equal_nan=True)
+            observation = env.step(np.nan_to_num(advice)).observation
+        assert same == alike
 
 
 @pytest.mark.parametrize("name", PLANNERS)

@@ -47,18 +47,22 @@ class FrontierPilot:
         """Return full speed toward each drone's frontier, nan where it is dead or knows of none that it can get to."""
         state, maps, air = self._state, env.maps.arrays, env.air
         over = env.twin.workers.over
+        # under the protocol `off` nobody is known, as on board
+        shares = air.rules.shares
+        parameters = self._parameters if shares else self._parameters._replace(peer_age_s=-1.0)
         over(
             env.worlds, survey_worlds, state, maps, env.estimates, env.alive, env.decisions.intents, air.state.peers,
-            env.ticks, air.rules.ticks_per_s, self._parameters, self._rays, scratch=self._scratch,
+            env.ticks, air.rules.ticks_per_s, parameters, self._rays, scratch=self._scratch,
         )  # fmt: skip
         if self._dealing == "greedy":
-            over(env.worlds, deal_worlds, state, maps, self._parameters, self._rays, scratch=self._scratch)
+            over(env.worlds, deal_worlds, state, maps, parameters, self._rays, scratch=self._scratch)
         else:
-            deal_by_assignment(state, self._parameters.cost_weight_per_m)
+            deal_by_assignment(state, parameters.cost_weight_per_m)
         actions = np.full((env.worlds, env.drones, env.settings.action.size), np.nan, np.float32)
         hold_s = (env.settings.action.decision_ticks - 1) * env.dt
         over(
-            env.worlds, fly_worlds, actions, state, maps, env.estimates, env.alive, env.decisions.parameters, hold_s
+            env.worlds, fly_worlds, actions, state, maps, env.estimates, env.alive, air.state.peers, env.ticks,
+            air.rules.ticks_per_s if shares else 0.0, env.decisions.parameters, hold_s,
         )  # fmt: skip
         return actions
 

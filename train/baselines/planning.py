@@ -18,10 +18,11 @@ from imagine.core.frontier_gaps import fill_flyable
 from imagine.core.frontier_paths import FAR, FRONTIER
 from imagine.core.frontier_targets import distance_m, expected_gain, fill_ways, find_targets, nearest_open
 from imagine.core.frontier_ways import follow, trace_back
+from imagine.train.baselines.courtesy import keep_right
 from imagine.train.baselines.plan_state import DUE
 
 _OWN_RINGS, _PEER_RINGS = 4, 12
-_STILL_M, _STILL_DECISIONS, _BANNED_DECISIONS = 0.3, 40, 200
+_STILL_M, _STILL_DECISIONS, _BANNED_DECISIONS = 0.3, 20, 400  # turning round on the spot takes 10 decisions at most
 _GOAL_CELLS = 2
 
 
@@ -160,8 +161,15 @@ def deal_worlds(first, last, state, maps, parameters, rays, scratch):  # type: i
 
 
 @numba.njit(cache=True, nogil=True)
-def fly_worlds(first, last, actions, state, maps, poses, alive, action_parameters, hold_s):  # type: ignore[no-untyped-def]
-    """Take up what was dealt, and fill the `actions` (float32 `[worlds, drones, size]`) of those who have a goal."""
+def fly_worlds(  # type: ignore[no-untyped-def]
+    first, last, actions, state, maps, poses, alive, peers, ticks, ticks_per_s, action_parameters, hold_s
+):
+    """Take up what was dealt, and fill the `actions` (float32 `[worlds, drones, size]`) of those who have a goal.
+
+    Drones that meet keep to the right, as far as `peers` (PEER records `[worlds, drones, drones]`) tell; `ticks_per_s`
+    0 stands for no radio.
+    """
+    speed = action_parameters[2]
     for world in range(first, last):
         for drone in range(poses.shape[1]):
             if not alive[world, drone]:
@@ -188,8 +196,11 @@ def fly_worlds(first, last, actions, state, maps, poses, alive, action_parameter
                 state.age[world, drone] = DUE
             length = math.sqrt(d_row * d_row + d_column * d_column)
             if length < 1e-6:
-                length = 1.0
-            numbers = action_toward_kernel(d_column / length, d_row / length, action_parameters, yaw, hold_s)
+                continue
+            dx, dy = d_column / length, d_row / length
+            if ticks_per_s > 0.0:
+                dx, dy = keep_right(dx, dy, drone, x, y, peers[world, drone], ticks[world], ticks_per_s, speed)
+            numbers = action_toward_kernel(dx, dy, action_parameters, yaw, hold_s)
             for k in range(actions.shape[2]):
                 actions[world, drone, k] = numbers[k]
             intent = intent_kernel(numbers[0], numbers[1], numbers[2], action_parameters, x, y, yaw)
