@@ -20,7 +20,7 @@ from imagine.sim.level import Level
 from imagine.sim.level_names import expand_levels
 from imagine.sim.level_variants import LevelVariants
 
-FORMAT = "imagine-exploration-1"
+FORMAT = "imagine-exploration-2"
 _SHORTEST_TICKS = 50  # of an episode that is cut so that not all end at once
 
 
@@ -28,12 +28,14 @@ _SHORTEST_TICKS = 50  # of an episode that is cut so that not all end at once
 class Start:
     """All that an episode's beginning follows from, besides seed, key and settings.
 
-    `level` and `variant` as drawn, `generator` the state of the world's generator after that draw, `shown` and
-    `turns` how many levels the twin had shown and how many turns its LiDARs had taken in this world by then.
+    `level` and `variant` as drawn, and whether drones launch `anywhere` in it; `generator` the state of the world's
+    generator after these draws, `shown` and `turns` how many levels the twin had shown and how many turns its LiDARs
+    had taken in this world by then.
     """
 
     level: int
     variant: int
+    anywhere: bool
     generator: dict[str, Any]
     shown: int
     turns: int
@@ -74,7 +76,10 @@ class Episodes:
         """Draw a world's next episode, when it has shown so many levels."""
         generator = self.generators[world]
         level, variant = self.variants.draw(generator, self.weights)
-        return Start(level, variant, dict(generator.bit_generator.state), shown, int(self.turns[world]))
+        anywhere, designed = self._settings.random_launch, self._settings.as_designed
+        if designed > 0.0 and generator.random() < designed:
+            variant, anywhere = 0, False
+        return Start(level, variant, anywhere, dict(generator.bit_generator.state), shown, int(self.turns[world]))
 
     def begin(self, world: int, start: Start) -> Level:
         """Begin an episode and return its level; the world's generator goes on from after the level's draw."""
@@ -96,7 +101,9 @@ class Episodes:
         """Return how the episodes in progress began and came on; plain containers and arrays of the caller's own."""
         starts = [self._starts[world] for world in sorted(self._starts)]
         return {
-            "levels": np.array([(start.level, start.variant) for start in starts], np.int64).reshape(-1, 2),
+            "levels": np.array([(start.level, start.variant, start.anywhere) for start in starts], np.int64).reshape(
+                -1, 3
+            ),
             "start_generators": [start.generator for start in starts],
             "start_shown": np.array([start.shown for start in starts], np.int64),
             "start_turns": np.array([start.turns for start in starts], np.int64),
@@ -112,7 +119,7 @@ class Episodes:
             state["levels"].tolist(), state["start_generators"], state["start_shown"].tolist(),
             state["start_turns"].tolist(), strict=True,
         )  # fmt: skip
-        return [Start(level, variant, generator, shown, turns) for (level, variant), generator, shown, turns in rows]
+        return [Start(level, variant, bool(anywhere), *rest) for (level, variant, anywhere), *rest in rows]
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up all of a state but the beginnings of episodes: `begin` those first."""

@@ -171,7 +171,7 @@ class Exploration:
     def _begin(self, world: int, start: Start) -> None:
         level, generator = self._episodes.begin(world, start), self._episodes.generators[world]
         self.twin.episodes[world] = start.shown
-        launch = level.launch_poses(self.drones, generator if self.settings.random_launch else None)
+        launch = level.launch_poses(self.drones, generator if start.anywhere else None)
         self.twin.set_level(world, level, launch)
         column0, row0, _, _ = level.grid
         self.maps.clear(world, level.coverable, (column0, row0))

@@ -40,6 +40,10 @@ class ExplorationSettings(Settings):
     stop_coverage: float = Field(default=0.995, gt=0.0, le=1.0, description="an episode ends when so much is covered")
     random_launch: bool = Field(default=True, description="start anywhere, not at the level's launch point")
     mirror: bool = Field(default=True, description="show levels mirrored and turned as well")
+    as_designed: float = Field(
+        default=0.0, ge=0.0, le=1.0,
+        description="share of episodes in the level as it is, from its own launch point, whatever the two above say",
+    )  # fmt: skip
     stagger: bool = Field(default=False, description="give first episodes different lengths, so resets spread out")
     lidar: str = "ld19"
     lidar_beams: int | None = Field(

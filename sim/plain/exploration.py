@@ -86,9 +86,10 @@ class PlainExploration:
         self._swept = sweep_cells(cap, settings.action.speed_mps, TICK_S)
         self._draw_level()  # the batch draws one to be built with, too
 
-    def _draw_level(self) -> Level:
+    def _draw_level(self) -> tuple[Level, Level]:
+        """Draw a level; return it as it is, and the variant of it that was drawn."""
         variants = self._levels[self._generator.choice(len(self._levels), p=self._weights)]
-        return variants[self._generator.integers(len(variants))]
+        return variants[0], variants[self._generator.integers(len(variants))]
 
     def use(self, variant: Variant) -> None:
         """Go on by another variant's means."""
@@ -97,8 +98,10 @@ class PlainExploration:
 
     def reset(self) -> None:
         """Start a new episode, up to the first look around."""
-        level = self._draw_level()
+        as_it_is, level = self._draw_level()
         generator = self._generator if self.settings.random_launch else None
+        if self.settings.as_designed > 0.0 and self._generator.random() < self.settings.as_designed:
+            level, generator = as_it_is, None
         self.begin(level, level.launch_poses(self.drones, generator))
         self._took("rest")
         self.sense(self._scan())

@@ -52,6 +52,16 @@ def test_a_variant_is_the_mirrored_level_and_fits_the_grid(name: str) -> None:
     assert max(variants.get(0, k).grid[2] for k in range(8)) == variants.columns
 
 
+def test_an_episode_as_designed_is_the_level_itself_from_its_own_launch_point() -> None:
+    env = Exploration(ExplorationSettings(levels=("4",), worlds=40, drones=2, as_designed=0.5), 3)
+    env.reset()
+    level = load_level("4")
+    point = [(pose.x, pose.y, pose.yaw) for pose in level.launch_poses(2, None)]
+    designed = [np.allclose(poses, point) for poses in env.twin.poses]
+    assert 8 < sum(designed) < 32
+    assert all(same(env.twin.levels[world], level) for world in np.flatnonzero(designed))
+
+
 def test_without_mirrors_levels_are_shown_as_they_are() -> None:
     variants = LevelVariants(("1",), mirror=False)
     generator = np.random.default_rng(0)

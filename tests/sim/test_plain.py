@@ -283,9 +283,11 @@ def test_who_cannot_see_runs_into_things_is_punished_and_falls_in_both() -> None
     assert fallen >= 2
 
 
-@pytest.mark.parametrize("variant", ["plain", "plain-kernels"])
-def test_equal_seeds_launch_equal_episodes_and_end_them_alike(variant: Variant) -> None:
-    chosen = settings(levels=("0", "1", "3"), level_weights=(1.0, 2.0, 1.0), mirror=True, episode_ticks=4)
+@pytest.mark.parametrize(("variant", "as_designed"), [("plain", 0.0), ("plain-kernels", 0.0), ("plain", 0.5)])
+def test_equal_seeds_launch_equal_episodes_and_end_them_alike(variant: Variant, as_designed: float) -> None:
+    chosen = settings(
+        levels=("0", "1", "3"), level_weights=(1.0, 2.0, 1.0), mirror=True, episode_ticks=4, as_designed=as_designed
+    )
     env, plain = Exploration(chosen, seed=5), PlainExploration(chosen, 5, world=1, variant=variant)
     env.reset()
     plain.reset()

@@ -16,7 +16,7 @@ from imagine.train.evaluation.contenders import Contender
 _EVALUATED = {
     "levels": "give --levels", "drones": "give --drones", "protocol": "give --protocol", "worlds": "give --episodes",
     "level_weights": "every level has as many episodes", "mirror": "give --launch", "random_launch": "give --launch",
-    "stagger": "episodes are flown whole",
+    "as_designed": "give --launch", "stagger": "episodes are flown whole",
 }  # fmt: skip
 """Settings that an evaluation decides itself, and what to do or know instead."""
 _STOP_COVERAGE = ExplorationSettings().stop_coverage  # episodes of a training may end sooner

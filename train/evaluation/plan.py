@@ -60,6 +60,6 @@ class Plan:
         return env.model_copy(
             update={
                 "levels": (level,), "level_weights": None, "drones": group.drones, "protocol": group.protocol,
-                "mirror": anywhere, "random_launch": anywhere, "stagger": False,
+                "mirror": anywhere, "random_launch": anywhere, "as_designed": 0.0, "stagger": False,
             }
         )  # fmt: skip
