@@ -359,6 +359,22 @@ def level_check(
     check_levels(names, json_file)
 
 
+@level_app.command("floor")
+def level_floor(
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="levels, or files")],
+    drones: Annotated[int, typer.Option(min=1, max=16, help="in the team")] = 3,
+    launches: Annotated[int, typer.Option(min=0, help="from so many random places as well")] = 0,
+    share: Annotated[float, typer.Option(min=0.01, max=1.0, help="of the level that has to be seen")] = 0.9,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    json_file: JsonFile = None,
+) -> None:
+    """Tell how soon levels could be explored by drones that know them: no policy is quicker."""
+    check_outputs(json_file)
+    from imagine.floor_command import show_floors
+
+    show_floors(names, drones, launches, share, seed, json_file)
+
+
 @level_app.command("generate")
 def level_generate(
     seed: Annotated[int, typer.Option(min=0, help="the house's number; with --count the first one's")] = 0,

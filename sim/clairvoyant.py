@@ -1,0 +1,105 @@
+"""How soon a level could be explored by drones that know it: the floor that no policy gets below.
+
+Two numbers, for drones that fly at full speed from the first tick and share everything at once. The bound: when the
+shortest flights have come to where enough can be seen, as if there were a drone for every place. The plan: the best
+that annealing finds for this team, on the shortest ways between waypoints; a better one may exist. Who does not know
+the level needs longer than either.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from imagine.core.frames import Pose
+from imagine.core.raster import CELL
+from imagine.sim.clairvoyant_kernels import bits, mark_seen, quickest
+from imagine.sim.level import Level
+from imagine.sim.level_survey import SIGHT_M, cell_centres
+
+_EVERY = 2  # cells between points that are looked from
+_BEAMS = 450
+_WAYPOINTS, _MOST_WAYPOINTS = 400, 14
+_MOST_TICKS = 1000
+_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
+_DETOUR = 1.0275
+"""How much longer ways on a lattice with these steps may be than straight: 1 / cos(atan(1 / 2) / 2)."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Ticks of 0.1 s until the share is seen: the `bound` that nobody gets below, and the best `plan` found."""
+
+    bound: float
+    plan: float
+
+
+class Clairvoyant:
+    """A level with all that can be seen from every point of a 0.2 m lattice, and the shortest ways between them."""
+
+    def __init__(self, level: Level, sight_m: float = SIGHT_M) -> None:
+        """Look from everywhere in `level`, as far as drones map."""
+        column0, row0, _, _ = level.grid
+        rows, columns = np.nonzero(level.flyable[::_EVERY, ::_EVERY])
+        self._points = cell_centres(rows * _EVERY, columns * _EVERY, level.grid)
+        self._ways = _ways(level.flyable, rows * _EVERY, columns * _EVERY)
+        ids = np.full(level.coverable.shape, -1, np.int32)
+        wanted = level.coverable.astype(bool)
+        self._cells = int(wanted.sum())
+        ids[wanted] = np.arange(self._cells)
+        self._seen = np.zeros((len(self._points), (self._cells + 63) // 64), np.uint64)
+        segments, circles = level.segments, level.geometry.circles
+        mark_seen(self._seen, ids, self._points, segments, circles, sight_m, _BEAMS, column0, row0, CELL)
+
+    def floor(
+        self, launch: list[Pose], speed_mps: float = 0.8, share: float = 0.9, tries: int = 60_000, seed: int = 0
+    ) -> Floor:
+        """Return the floor from `launch` poses, annealing for `tries` changes of the plan."""
+        starts = np.array([np.hypot(*(self._points - (pose.x, pose.y)).T).argmin() for pose in launch])
+        needed = math.ceil(share * self._cells)
+        generator = np.random.default_rng(seed)
+        nodes = generator.permutation(len(self._points))[:_WAYPOINTS]
+        far, before = dijkstra(self._ways, indices=nodes, return_predecessors=True)
+        plan = quickest(
+            starts, nodes, far, before, self._seen, needed, speed_mps, _MOST_TICKS, tries, _MOST_WAYPOINTS, generator
+        )
+        return Floor(self._bound(starts, needed, speed_mps), float(plan))
+
+    def _bound(self, starts: NDArray[np.int64], needed: int, speed_mps: float) -> float:
+        metres = dijkstra(self._ways, indices=starts).min(axis=0)
+        order = np.argsort(metres)
+        low, high = 0, len(order)  # so many of the nearest points are enough
+        while low < high:
+            middle = (low + high) // 2
+            enough = bits(np.bitwise_or.reduce(self._seen[order[: middle + 1]], axis=0)) >= needed
+            low, high = (low, middle) if enough else (middle + 1, high)
+        if low == len(order) or not np.isfinite(metres[order[low]]):
+            return math.inf
+        apart = math.sqrt(2.0) * _EVERY * CELL  # both ends may lie so far from the lattice, together
+        return max(0.0, float(metres[order[low]]) / _DETOUR - apart) / speed_mps * 10.0
+
+
+def _ways(flyable: NDArray[np.bool_], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> csr_matrix:
+    """Return the graph of steps between lattice points, metres, where the middle of a step can be flown as well."""
+    ids = np.full(flyable.shape, -1, np.int64)
+    ids[rows, columns] = np.arange(len(rows))
+    begins, ends, metres = [], [], []
+    for d_row, d_column in _STEPS:
+        to_row, to_column = rows + _EVERY * d_row, columns + _EVERY * d_column
+        inside = (to_row < flyable.shape[0]) & (to_column >= 0) & (to_column < flyable.shape[1])
+        begin = np.flatnonzero(inside)
+        end = ids[to_row[begin], to_column[begin]]
+        half = flyable[rows[begin] + _EVERY * d_row // 2, columns[begin] + _EVERY * d_column // 2]
+        flown = (end >= 0) & half
+        begins.append(begin[flown])
+        ends.append(end[flown])
+        metres.append(np.full(int(flown.sum()), math.hypot(d_row, d_column) * _EVERY * CELL))
+    i, j, length = np.concatenate(begins), np.concatenate(ends), np.concatenate(metres)
+    size = len(rows)
+    both = (np.concatenate((length, length)), (np.concatenate((i, j)), np.concatenate((j, i))))
+    return coo_matrix(both, shape=(size, size)).tocsr()
