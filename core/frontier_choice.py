@@ -30,7 +30,9 @@ from imagine.core.frontier_ways import follow, trace_back
 
 FRONTIER_NUMBERS = 14
 """Numbers for each frontier shown, see `fill_frontiers`."""
-_WAY_M, _OFFSET_M, _MOST = 10.0, 10.0, 3.0
+OFFSET_M, OFFSETS = 10.0, 8
+"""Metres that read as 1 in the offset to a frontier, and the first of its two numbers."""
+_WAY_M, _MOST = 10.0, 3.0
 _CLUSTER_CELLS = 6  # 1.2 m
 _NEAR_CELLS, _FAR_CELLS = 20, 30  # what may be seen: at a target, 4 m around it, and where it leads, 6 m
 _COST_PER_M = 0.1  # of the logarithm of what is seen, as the coordinated planner weighs a way
@@ -146,8 +148,8 @@ def fill_frontiers(  # type: ignore[no-untyped-def]
                 second = min(second, ways[robot, best])
             if dealt[robot] == best:
                 to_peer = 1.0
-        dx = (cell % columns + 0.5 - at_column) * (PLAN_CELL / _OFFSET_M)
-        dy = (cell // columns + 0.5 - at_row) * (PLAN_CELL / _OFFSET_M)
+        dx = (cell % columns + 0.5 - at_column) * (PLAN_CELL / OFFSET_M)
+        dy = (cell // columns + 0.5 - at_row) * (PLAN_CELL / OFFSET_M)
         row_out = frontiers[shown]
         row_out[0] = 1.0
         row_out[1] = (cos_turn * d_column + sin_turn * d_row) / norm

@@ -20,7 +20,7 @@ from imagine.sim.metrics import EpisodeMetrics
 from imagine.train.labels import LabelBuffer, Round, RoundBuffer
 from imagine.train.networks import Actor, Precision, at_precision
 from imagine.train.pilots import Pilot
-from imagine.train.rollout import Recall, agent_tensors, env_actions, living, next_decisions, stored
+from imagine.train.rollout import Recall, agent_tensors, env_actions, estimates, living, next_decisions, stored
 
 _SAME_WAY = 0.03  # of 1 - cosine: directions up to about 10 degrees apart count as one
 _ALONG = 0.7  # cosine from which on a label points at a frontier
@@ -78,7 +78,8 @@ def collect_labels(
     added = 0
     flown = Round.empty(recall) if isinstance(buffer, RoundBuffer) else None
     with at_precision(precision, actor):
-        for _ in range(steps):
+        noise = actor.noise(steps, agents, generator)
+        for t in range(steps):
             seen = stored(agent_tensors(observation, actor.is_central), torch.float16, actor.device)
             alive = living(env)
             labels = torch.from_numpy(teacher.act(env, observation).reshape(agents, -1))
@@ -89,7 +90,7 @@ def collect_labels(
             elif isinstance(buffer, LabelBuffer):
                 buffer.add({key: value[labelled] for key, value in seen.items()}, labels[labelled])
             decisions = next_decisions(actor, {**seen, "alive": alive.to(actor.device)}, recall, env.drones)
-            drawn, _ = actor.draw(decisions, actor.noise((agents,), generator))
+            drawn, _ = actor.draw(decisions, noise[t], seen, estimates(env))
             actions = actor.flown(seen, drawn).cpu()
             by_planner = planner_flies & labelled
             actions[by_planner] = labels[by_planner]

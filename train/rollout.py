@@ -125,6 +125,11 @@ def living(env: Exploration) -> Tensor:
     return torch.from_numpy(env.alive.reshape(-1).copy())
 
 
+def estimates(env: Exploration) -> Tensor:
+    """Return where drones take themselves to be, `[agents, 3]`."""
+    return torch.from_numpy(env.estimates.reshape(-1, 3))
+
+
 def stored(tensors: Seen, dtype: torch.dtype, device: torch.device) -> Seen:
     """Return an observation as rollouts keep it: on the device of the networks, images `dtype` and channels last."""
     return {
@@ -185,7 +190,7 @@ def collect(
     with at_precision(precision, actor):
         recall = recall or Recall.nothing(actor, env.worlds * env.drones)
         if noise is None:
-            noise = actor.noise((steps, env.worlds * env.drones), generator)
+            noise = actor.noise(steps, env.worlds * env.drones, generator)
         return _collect(env, observation, actor, noise, recall, chunk_steps(steps, sequence_steps))
 
 
@@ -217,7 +222,7 @@ def _collect(
             if t % chunk == 0:
                 states.append(recall.state.clone())
         decisions = next_decisions(actor, {**seen, "alive": alive[t]}, recall, env.drones)
-        actions[t], log_probs[t] = actor.draw(decisions, noise[t])
+        actions[t], log_probs[t] = actor.draw(decisions, noise[t], seen, estimates(env))
         began = time.perf_counter()
         step = env.step(env_actions(actor.flown(seen, actions[t]), env))
         env_s += time.perf_counter() - began

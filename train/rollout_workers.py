@@ -75,7 +75,7 @@ class RolloutWorkers:
         import ray
 
         bounds = np.cumsum([0, *(len(keys) * self._drones for keys in self._parts)]).tolist()
-        noise = actor.noise((self._ppo.rollout_steps, bounds[-1]), generator).cpu()  # as one process draws it
+        noise = actor.noise(self._ppo.rollout_steps, bounds[-1], generator).cpu()  # as one process draws it
         weights = ray.put({name: value.cpu() for name, value in actor.state_dict().items()})
         draws = [noise[:, first:last].clone() for first, last in itertools.pairwise(bounds)]
         rollout = joined(self._ask("collect", _COLLECT_S, [(weights, own) for own in draws]))

@@ -90,7 +90,7 @@ def test_given_noise_is_taken_in_place_of_draws():
     for given in (False, True):
         env = Exploration(SETTINGS.env, 3)
         generator = torch.Generator().manual_seed(5)
-        noise = learner.actor.noise((4, 6), generator) if given else None
+        noise = learner.actor.noise(4, 6, generator) if given else None
         flights.append(collect(env, env.reset(), learner.actor, 4, generator, noise=noise)[0])
     assert torch.equal(flights[0].actions, flights[1].actions)
     assert torch.equal(flights[0].rewards, flights[1].rewards)

@@ -16,7 +16,10 @@ from imagine.train.networks.choice import (
     choice_log_probability,
     direction_of,
     draw_choice,
+    draw_coherent,
+    places_of,
 )
+from imagine.train.networks.coherent import coherent_noise
 from imagine.train.networks.computing import Computing, autocast
 from imagine.train.networks.encoders import LEVEL_CELLS, LEVEL_CHANNELS, Encoder, orthogonal
 from imagine.train.networks.gaussian import LOG_STD_RANGE, entropy, log_probability
@@ -79,6 +82,8 @@ class Actor(Computing):
             numbers = spec.shapes["frontiers"][1]
             self.choice = ChoiceHead(numbers, self.feature_size, hidden // 2)
         self.taken_size = action_size if self.choice is None else 1
+        self.is_coherent = self.choice is not None and settings.choice_noise == "coherent"
+        self._along_heading = spec.axes == "heading"
         self.log_std = nn.Parameter(torch.full((action_size,), settings.log_std))
         memory = self.gated or self.stack
         self.state_size = 0 if memory is None else memory.size
@@ -142,19 +147,26 @@ class Actor(Computing):
             wanted = wanted + nn.functional.pad(steered, (0, self.action_size - steered.shape[1]))
         return Decisions(torch.tanh(wanted), features, state)
 
-    def noise(self, rows: tuple[int, ...], generator: torch.Generator) -> Tensor:
-        """Return what `draw` needs of chance, `[*rows, taken size]`: the same whoever flies the rows."""
-        size = (*rows, self.taken_size)
+    def noise(self, steps: int, agents: int, generator: torch.Generator) -> Tensor:
+        """Return what `draw` needs of chance in so many steps, `[steps, agents, n]`: the same whoever flies them."""
+        if self.is_coherent:
+            return coherent_noise(steps, agents, generator).to(self.device)
+        size = (steps, agents, self.taken_size)
         drawn = torch.randn(size, generator=generator) if self.choice is None else torch.rand(size, generator=generator)
         return drawn.to(self.device)
 
-    def draw(self, decisions: Decisions, noise: Tensor) -> tuple[Tensor, Tensor]:
+    def draw(self, decisions: Decisions, noise: Tensor, seen: Seen, poses: Tensor) -> tuple[Tensor, Tensor]:
         """Return what is done in training, `[rows, taken size]`, and its log density, `[rows]`.
 
-        It is an action, or the number of a frontier; `flown` makes either an action. `noise` is of as many rows.
+        It is an action, or the number of a frontier; `flown` makes either an action. `noise` is of as many rows, and so
+        are `poses`, `[rows, 3]`: where drones take themselves to be.
         """
         if decisions.scores is not None:
-            choice = draw_choice(decisions.scores, noise.squeeze(1))
+            if self.is_coherent:
+                places = places_of(seen["frontiers"], poses.to(self.device, torch.float32), self._along_heading)
+                choice = draw_coherent(decisions.scores, noise, places)
+            else:
+                choice = draw_choice(decisions.scores, noise.squeeze(1))
             return choice.unsqueeze(1).float(), choice_log_probability(decisions.scores, choice)
         taken = decisions.mean + self.spread().exp() * noise
         return taken, self.log_probability(decisions.mean, None, taken)

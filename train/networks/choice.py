@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from imagine.core.frontier_choice import OFFSET_M, OFFSETS
+from imagine.train.networks.coherent import gumbel_at
 from imagine.train.networks.encoders import orthogonal
 
 _NOT_SHOWN = 1e4  # what a row without a frontier has its score lowered by
@@ -48,6 +50,25 @@ def draw_choice(scores: Tensor, uniform: Tensor) -> Tensor:
     reached = torch.softmax(scores, dim=1).cumsum(dim=1)
     below = (reached <= uniform.unsqueeze(1) * reached[:, -1:]).sum(dim=1)
     return below.clamp(max=scores.shape[1] - 1)
+
+
+def draw_coherent(scores: Tensor, noise: Tensor, places: Tensor) -> Tensor:
+    """Return choices, int64 `[rows]`, by scores and the drones' fields (`coherent_noise`) at the frontiers' places."""
+    return (scores + gumbel_at(noise, places)).argmax(dim=1)
+
+
+def places_of(frontiers: Tensor, poses: Tensor, along_heading: bool) -> Tensor:
+    """Return where frontiers `[rows, n, numbers]` lie in the map, `[rows, n, 2]`, metres.
+
+    `poses` `[rows, 3]` are where the drones that are shown them take themselves to be; `along_heading`: they are shown
+    along the heading, not along the map's axes.
+    """
+    offsets = frontiers[..., OFFSETS : OFFSETS + 2] * OFFSET_M
+    if along_heading:
+        cosine, sine = poses[:, 2:].cos(), poses[:, 2:].sin()
+        x, y = offsets.unbind(dim=2)
+        offsets = torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=2)
+    return poses[:, None, :2] + offsets
 
 
 def choice_log_probability(scores: Tensor, choice: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ Width = Annotated[int, Field(ge=1, le=1024)]
 ViewKind = Literal["strided", "patch"]
 LidarKind = Literal["dense", "conv1", "conv2"]
 HeadKind = Literal["gaussian", "choice"]
+ChoiceNoise = Literal["independent", "coherent"]
 MemoryKind = Literal["none", "gru", "stack"]
 EncoderKind = Literal["separate", "shared"]
 
@@ -30,6 +31,10 @@ class NetworkSettings(Settings):
     head: HeadKind = Field(
         default="gaussian",
         description="gaussian: a mean action, drawn around; choice: one of the frontiers seen, and the way to it",
+    )
+    choice_noise: ChoiceNoise = Field(
+        default="coherent",
+        description="in training, of the head choice: drawn anew in every decision, or staying with a frontier a while",
     )
     memory: MemoryKind = Field(
         default="none", description="of the actor: a gated recurrent unit, or the newest views through 3-D convolutions"
