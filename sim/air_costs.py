@@ -10,8 +10,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from imagine.core.raster import TILE
-from imagine.mesh_comm.codec import RANGE_STEP_M
+from imagine.core.raster import RANGE_STEP_M, TILE
 from imagine.mesh_comm.messages import MAX_DATAGRAM
 from imagine.mesh_comm.seal import OVERHEAD
 
