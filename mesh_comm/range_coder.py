@@ -145,7 +145,7 @@ def is_used_up(state):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def has_only_zeros_left(data, state):  # type: ignore[no-untyped-def]
     """Tell whether what a decoder has not read of `data` are zeros, if anything."""
-    for at in range(state[2], state[3]):
+    for at in range(state[2], state[3]):  # numba compiles no generators  # noqa: SIM110
         if data[at] != 0:
             return False
     return True
@@ -155,9 +155,9 @@ def has_only_zeros_left(data, state):  # type: ignore[no-untyped-def]
 def number_steps(value, first, steps, at):  # type: ignore[no-untyped-def]
     """Write the steps of a number, 0 to 2^40 - 2, into `steps` from `at`; return the place after them.
 
-    The gamma code of Elias (1975) of the number plus one: how often it can be halved, as so many ones and a zero, by the
-    contexts from `first` on; then its digits below the leading one, highest first, of which the first has contexts by
-    the length, `LONGEST_BITS` further on, and the others even odds.
+    The gamma code of Elias (1975) of the number plus one: how often it can be halved, as so many ones and a zero, by
+    the contexts from `first` on (the longest has no zero); then its digits below the leading one, highest first, of
+    which the first has contexts by the length, `LONGEST_BITS` further on, and the others even odds.
     """
     length, rest = 0, (value + 1) >> 1
     while rest > 0:

@@ -1,10 +1,11 @@
 """How likely a scan's ranges are, beam after beam: what the range coder packs a scan by.
 
-A beam's code is 0 invalid, 1 no return, or a range in steps plus 2. Whether a beam differs in kind (invalid, no return,
-hit) from the beam before, and which of the other two it is, have contexts by the kinds of the two beams before. A hit is
-told as what it is off a prediction: walls are smooth and the sensor is not, so a filter of place and slope (alpha-beta,
-Kalata 1984) follows the hits, in 1/16 steps, and starts anew where a hit is far off. Size and sign of the difference
-have contexts by the sizes of the two differences before it. The chances learn as the scan goes, for sensors differ.
+A beam's code is 0 invalid, 1 no return, or a range in steps plus 2. Whether a beam differs in kind (invalid, no
+return, hit) from the beam before, and which of the other two it is, have contexts by the kinds of the two beams before.
+A hit is told as what it is off a prediction: walls are smooth and the sensor is not, so a filter of place and slope
+(alpha-beta, Kalata 1984) follows the hits, in 1/16 steps, and starts anew where a hit is far off. Size and sign of the
+difference have contexts by the sizes of the two differences before it. The chances learn as the scan goes, for sensors
+differ.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _AFTER_GAP = _ROUGHNESSES  # the first hit behind beams without one
 KINDS = 1
 """Where the contexts of kinds begin, by the kind of the beam before, of that before it, and by which of two bits."""
 SIGNS = KINDS + 18
-"""... of "is below the prediction", by roughness and by the sign of the difference before (0 none, 1 above, 2 below)."""
+"""... of "is below the prediction", by roughness and the sign of the difference before (0 none, 1 above, 2 below)."""
 SIZES = SIGNS + 3 * (_ROUGHNESSES + 1)
 """... of the sizes of differences, by roughness."""
 SCAN_CONTEXTS = SIZES + (_ROUGHNESSES + 1) * NUMBER_CONTEXTS

@@ -25,7 +25,10 @@ BIAS = MAX_TILES
 MOST_LISTED = 4096
 """No list holds more tiles."""
 TILES_A_BYTE = 64
-"""Nor more tiles than this for each of its bytes, and so many again: what a few bytes cost to read is bounded. Zeros make up for missing bytes."""
+"""Nor more tiles than this for each of its bytes, and so many again: what a few bytes cost to read is bounded.
+
+Zeros make up for missing bytes.
+"""
 _COUNT, _COLUMN, _ROW, _ROW_AFTER, _VERSION = (1 + k * NUMBER_CONTEXTS for k in range(5))
 VERSION_CONTEXTS = 1 + 5 * NUMBER_CONTEXTS
 MOST_ENTRY_STEPS = 3 * MOST_NUMBER_STEPS
@@ -72,7 +75,7 @@ def decode_count(data, zeros, state):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def decode_entries(data, zeros, state, entries):  # type: ignore[no-untyped-def]
-    """Read `entries` (int64 `[count, 3]`) behind the count; return whether they are sorted, in bounds, and all there is.
+    """Read `entries` (int64 `[count, 3]`) behind the count; return whether they are sorted, in bounds, and the last.
 
     `zeros` int64 `[VERSION_CONTEXTS]` learn.
     """
