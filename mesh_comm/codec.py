@@ -7,6 +7,7 @@ bytes, however damaged, take more time or memory to read than sound ones.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +31,8 @@ from imagine.mesh_comm.version_model import (
 
 _CHANCES = load_chances()
 _SPARE_BYTES = 8  # what the coder wants free behind its last byte
-_MOST_BEAM_BYTES = 12  # none takes more: eleven bits for each step that learns, and less than 40 that do not
-_MOST_ENTRY_BYTES = 64
+_MOST_BEAM_BYTES = 24  # no step takes more than 11 bits: two of kind, 12 and 11 of a size up to 3000, one of sign
+_MOST_ENTRY_BYTES = 192  # three numbers, each of at most 40 steps that learn, and 39 digits
 
 
 def pack_ranges(ranges: NDArray[np.float32], range_min: float, range_cap: float) -> bytes:
@@ -63,10 +64,7 @@ def unpack_ranges(packed: bytes, beams: int, range_cap: float) -> NDArray[np.flo
     codes = np.empty(beams, np.int64)
     if not decode_scan(np.frombuffer(packed, np.uint8), _CHANCES.scan.copy(), largest_code(range_cap), codes):
         raise InputError(f"mesh scan: {len(packed)} bytes do not tell {beams} ranges up to {range_cap} m")
-    metres = np.minimum((codes - FIRST_RANGE) * RANGE_STEP_M, range_cap)
-    ranges: NDArray[np.float32] = metres.astype(np.float32)
-    ranges[codes == INVALID] = np.nan
-    ranges[codes == NO_RETURN] = np.inf
+    ranges: NDArray[np.float32] = _metres(range_cap)[codes]
     return ranges
 
 
@@ -113,6 +111,15 @@ def unpack_versions(packed: bytes) -> dict[TileKey, int]:
     if not decode_entries(data, zeros, state, entries):
         raise InputError(f"mesh version list: {len(packed)} bytes do not tell of {count} tiles that a map can hold")
     return {TileKey(column, row): version for column, row, version in entries.tolist()}
+
+
+@lru_cache(maxsize=8)
+def _metres(range_cap: float) -> NDArray[np.float32]:
+    """Return the range in metres of every code up to the largest."""
+    steps = np.arange(largest_code(range_cap) + 1) - FIRST_RANGE
+    metres = np.minimum(steps * RANGE_STEP_M, range_cap).astype(np.float32)
+    metres[INVALID], metres[NO_RETURN] = np.nan, np.inf
+    return metres
 
 
 def largest_code(range_cap: float) -> int:

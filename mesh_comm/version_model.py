@@ -20,8 +20,8 @@ from imagine.mesh_comm.range_coder import (
     start_decoder,
 )
 
-BIAS = MAX_TILES
-"""What is added to columns, so that the first is no less than 0."""
+BIAS = MAX_TILES + 1
+"""What is added to columns, so that the first is above 0."""
 MOST_LISTED = 4096
 """No list holds more tiles."""
 TILES_A_BYTE = 64

@@ -88,13 +88,11 @@ def float32_bytes(layer: NDArray[np.int8]) -> int:
 def test_a_layer_takes_less_than_thrice_what_xz_makes_of_free_and_occupied(layers: list[NDArray[np.int8]]) -> None:
     for layer in layers:
         sent = hand_over([layer])
-        print(sent, xz_bytes(layer), float32_bytes(layer))
         assert sent < 2 * xz_bytes(layer)
         assert sent * 60 < float32_bytes(layer)
 
 
 def test_the_whole_map_takes_no_more_than_its_layers(layers: list[NDArray[np.int8]]) -> None:
     sent = hand_over(layers)
-    print(sent, xz_bytes(np.vstack(layers)))
     assert sent < 2 * sum(map(xz_bytes, layers))
     assert sent * 60 < sum(map(float32_bytes, layers))
