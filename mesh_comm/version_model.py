@@ -92,7 +92,7 @@ def decode_entries(data, zeros, state, entries):  # type: ignore[no-untyped-def]
                 return False
         column += column_step
         version += _unzigzag(decode_number(data, state, zeros, _VERSION))
-        if column > MAX_TILES or abs(row) > MAX_TILES or version < 0 or version >= 1 << 32:
+        if abs(column) > MAX_TILES or abs(row) > MAX_TILES or version < 0 or version >= 1 << 32:
             return False
         entries[k, 0], entries[k, 1], entries[k, 2] = column, row, version
     return has_only_zeros_left(data, state)
