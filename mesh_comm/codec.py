@@ -117,7 +117,7 @@ def unpack_versions(packed: bytes) -> dict[TileKey, int]:
 def _metres(range_cap: float) -> NDArray[np.float32]:
     """Return the range in metres of every code up to the largest."""
     steps = np.arange(largest_code(range_cap) + 1) - FIRST_RANGE
-    metres = np.minimum(steps * RANGE_STEP_M, range_cap).astype(np.float32)
+    metres: NDArray[np.float32] = np.minimum(steps * RANGE_STEP_M, range_cap).astype(np.float32)
     metres[INVALID], metres[NO_RETURN] = np.nan, np.inf
     return metres
 
