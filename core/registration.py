@@ -257,15 +257,27 @@ def are_apart(a: Pose, b: Pose, middle: NDArray[np.float64]) -> bool:
     return math.hypot(shift[0], shift[1]) > _APART_M or abs(wrap_angle(a.yaw - b.yaw)) > _APART_RAD
 
 
+class Within(NamedTuple):
+    """What is known of a pose beforehand: the peer's origin lies at most `radius_m` from (x, y) of the reference."""
+
+    x: float
+    y: float
+    radius_m: float
+
+    def holds(self, pose: Pose) -> bool:
+        """Tell whether a pose is possible."""
+        return math.hypot(pose.x - self.x, pose.y - self.y) <= self.radius_m
+
+
 class Search:
     """The search over all yaws and shifts, in slices: `advance` until `found` is not None.
 
     A slice is a few yaws, then a hypothesis refined; what comes out does not depend on how it is sliced.
     """
 
-    def __init__(self, reference: Field, peer: Field) -> None:
-        """Prepare: about a slice's time."""
-        self.reference, self.peer = reference, peer
+    def __init__(self, reference: Field, peer: Field, within: Within | None = None) -> None:
+        """Prepare: about a slice's time. Poses not `within` what is known beforehand are no hypotheses."""
+        self.reference, self.peer, self._within = reference, peer, within
         self.found: list[Hypothesis] | None = None
         self._yaw = 0
         self._peaks: list[tuple[float, Pose]] = []
@@ -345,7 +357,8 @@ class Search:
     def _distinct(self) -> list[Pose]:
         chosen: list[Pose] = []
         for _, pose in sorted(self._peaks, key=lambda peak: -peak[0]):
-            if all(are_apart(pose, other, self._about) for other in chosen):
+            is_possible = self._within is None or self._within.holds(pose)
+            if is_possible and all(are_apart(pose, other, self._about) for other in chosen):
                 chosen.append(pose)
             if len(chosen) == _REFINED:
                 break
