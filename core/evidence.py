@@ -85,7 +85,7 @@ class EvidenceMap:
         self.corner = TileKey(-tiles, -tiles)
         self.tile_rows = self.tile_columns = 2 * tiles
         self.layers: dict[int, Layer] = {own: Layer.empty(self.tile_rows, self.tile_columns)}
-        self._unsaid = IDENTITY if shares_frame else None
+        self.shares_frame = shares_frame
         self._placements: dict[int, Pose | None] = {own: IDENTITY}
         self._placed: dict[int, PlacedLayer] = {}
 
@@ -203,7 +203,7 @@ class EvidenceMap:
 
     def placement(self, source: int) -> Pose | None:
         """Return where a source's frame lies in the own, metres and radians; None while that is not known."""
-        return self._placements.get(source, self._unsaid)
+        return self._placements.get(source, IDENTITY if self.shares_frame else None)
 
     def placed(self) -> dict[int, NDArray[np.int8]]:
         """Return what of every placed source counts in the belief, int8 `[rows, columns]` on the own grid; views.

@@ -46,7 +46,9 @@ class PlacedLayer:
         back = inverse(self.pose)
         _resample(source, self.cells, touched, back.x, back.y, back.yaw, *origin_cells)
 
-    def extent(self, source: NDArray[np.int8], origin_cells: tuple[int, int]) -> tuple[float, float, float, float] | None:
+    def extent(
+        self, source: NDArray[np.int8], origin_cells: tuple[int, int]
+    ) -> tuple[float, float, float, float] | None:
         """Return x and y, least then greatest, metres, that what is known of `source` takes up in the own frame."""
         is_row, is_column = source.any(axis=1), source.any(axis=0)
         if not is_row.any():

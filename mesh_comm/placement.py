@@ -1,4 +1,4 @@
-"""Where peers' frames lie in the own: estimated from overlapping maps, trusted once confirmed, withdrawn if contradicted.
+"""Where peers' frames lie in the own: estimated from overlapping maps, trusted once confirmed, withdrawn if denied.
 
 One estimate is never believed. A place is trusted when it is unambiguous and later estimates, from maps that overlap
 further than those before, find it again: then it has foretold evidence that it was not made from. A trusted place is
@@ -10,46 +10,20 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from imagine.core.config import Settings
 from imagine.core.evidence import EvidenceMap
 from imagine.core.frames import IDENTITY, Pose, compose, relative, transform_points, wrap_angle
-from imagine.core.registration import Field as MapField
-from imagine.core.registration import Fit, Hypothesis, Search, Within, are_apart, field_of, judge, refine
+from imagine.core.map_field import Field, Fit, field_of, judge
+from imagine.core.registration import Hypothesis, Search, Within, are_apart, refine
+from imagine.mesh_comm.alignment import AlignmentSettings
 from imagine.mesh_comm.messages import GROUND
 
 Standing = Literal["given", "trusted", "candidate", "unknown"]
 _log = logging.getLogger(__name__)
-
-
-class AlignmentSettings(Settings):
-    """When a place is believed, and how often it is looked for. Cells are 0.01 m² of map, or 0.1 m of wall."""
-
-    period_s: float = Field(default=3.0, gt=0.0, description="between estimates for the same peer")
-    yaws_per_slice: int = Field(default=6, ge=1, description="of the 120 yaws searched, so many in one call")
-    least_overlap: int = Field(default=1000, ge=1, description="cells known to both maps, or an estimate says nothing")
-    least_matched: int = Field(default=100, ge=1, description="cells of wall that both maps have")
-    least_balance: float = Field(default=0.3, ge=0.0, le=1.0, description="walls across over walls along")
-    most_contradiction: float = Field(default=0.03, ge=0.0, le=1.0, description="share of walls the other map denies")
-    most_rival: float = Field(default=0.5, ge=0.0, lt=1.0, description="score of the next best place over the best's")
-    more_overlap: int = Field(default=300, ge=1, description="cells that an estimate must add to confirm the last")
-    confirmations: int = Field(default=2, ge=1, description="estimates that must confirm the first")
-    agree_m: float = Field(default=0.2, gt=0.0, description="estimates this near to each other are the same place")
-    agree_rad: float = Field(default=math.radians(3.0), gt=0.0)
-    move_m: float = Field(default=0.02, ge=0.0, description="a trusted place is moved when it is better by so much")
-    move_rad: float = Field(default=math.radians(0.2), ge=0.0)
-    withdraw_contradiction: float = Field(default=0.06, ge=0.0, le=1.0)
-    withdraw_rival: float = Field(default=0.85, ge=0.0, le=1.0)
-    strikes: int = Field(default=2, ge=1, description="bad checks in a row that withdraw a trusted place")
-    launch_radius_m: float | None = Field(
-        default=None, gt=0.0, description="frames begin at most so far apart, or from where the layout has them"
-    )
-    search_every: int = Field(default=3, ge=1, description="of the checks of a trusted place, each so many-eth searches")
 
 
 class Place(NamedTuple):
@@ -72,7 +46,7 @@ class _Track:
     is_given: bool = False
     strikes: int = 0
     checks: int = 0
-    seen: tuple[int, int] = field(default=(0, 0))
+    seen: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -88,7 +62,9 @@ class Placements:
     lends it its frame.
     """
 
-    def __init__(self, evidence: EvidenceMap, settings: AlignmentSettings, layout: dict[int, Pose] | None = None) -> None:
+    def __init__(
+        self, evidence: EvidenceMap, settings: AlignmentSettings, layout: dict[int, Pose] | None = None
+    ) -> None:
         """Begin; `layout` says where each drone's frame (its launch) lies in a common one, metres and radians.
 
         Drones that it names are placed at once, drones that it does not name are searched for.
@@ -251,7 +227,7 @@ class Placements:
             return self._strike(source, fit, "another place explains the maps as well")
         return self._check(source, search.reference, search.peer)
 
-    def _check(self, source: int, reference: MapField, peer: MapField) -> list[int]:
+    def _check(self, source: int, reference: Field, peer: Field) -> list[int]:
         """Look whether the newest maps bear a place out, and move it to where they fit best."""
         held, track, settings = self._held(source), self._tracks[source], self._settings
         if held is None:
@@ -285,12 +261,12 @@ class Placements:
         _log.warning("the frame of drone %d is not known any more: %s", source, why)
         return [source]
 
-    def _agree(self, a: Pose, b: Pose, peer: MapField) -> bool:
+    def _agree(self, a: Pose, b: Pose, peer: Field) -> bool:
         shift, turn = _difference(a, b, peer)
         return shift <= self._settings.agree_m and turn <= self._settings.agree_rad
 
 
-def _difference(a: Pose, b: Pose, peer: MapField) -> tuple[float, float]:
+def _difference(a: Pose, b: Pose, peer: Field) -> tuple[float, float]:
     """Return how far apart two poses lay the middle of the peer's walls, metres, and their angle, radians."""
     middle = peer.centre[None]
     shift = transform_points(a, middle)[0] - transform_points(b, middle)[0]
