@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,8 @@ CLEAR_M = 0.35
 """A wall further than this from the other map's, on cells clear there, contradicts it; less may be drift."""
 CONTRADICTION_WEIGHT = 3.0
 """How many cells of matching wall one of contradicting wall outweighs."""
+_HOLD_M = 0.35  # twice what still matches, and a little
+_HOLD_BEARINGS = 8
 _MARGIN_M = 1.0  # around the known cells, where distances to walls are still told
 
 
@@ -40,6 +43,13 @@ class Field:
     known: NDArray[np.bool_]
     walls: NDArray[np.float64]
     frees: NDArray[np.float64]
+
+    @cached_property
+    def opens(self) -> NDArray[np.float64]:
+        """Centres of the clear cells with no wall near, metres `[n, 2]`: where another map's wall contradicts."""
+        row, column, _ = _cells(self, self.frees)
+        far: NDArray[np.float64] = self.frees[self.distance[row, column] > CLEAR_M]
+        return far
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -72,14 +82,14 @@ def field_of(cells: NDArray[np.int8], origin_cells: tuple[int, int]) -> Field | 
 class Fit(NamedTuple):
     """How well two maps agree under a pose, in cells: of wall where both know, both ways round, and in all.
 
-    `matched` and `contradicted` walls; `overlap` cells known to both; `balance` in [0, 1] how evenly the matched walls
-    fix the two directions (0: one straight corridor, along which the pose is free; 1: as many either way).
+    `matched` and `contradicted` walls; `overlap` cells known to both; `hold` the share of matched walls, 0 to 1, that a
+    shift in the loosest direction would lose: little in a corridor, along which the pose is free.
     """
 
     matched: float
     contradicted: float
     overlap: int
-    balance: float
+    hold: float
 
     @property
     def score(self) -> float:
@@ -100,7 +110,7 @@ def judge(reference: Field, peer: Field, pose: Pose) -> Fit:
     overlap = int(np.count_nonzero(reference.known[row[inside], column[inside]]))
     return Fit(
         (forth.matched + back.matched) / 2.0, (forth.contradicted + back.contradicted) / 2.0, overlap,
-        _balance(reference, transform_points(pose, peer.walls)),
+        _hold(reference, transform_points(pose, peer.walls)),
     )  # fmt: skip
 
 
@@ -125,15 +135,20 @@ def _cells(field: Field, points: NDArray[np.float64]) -> tuple[NDArray[np.int64]
     return row, column, (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
 
 
-def _balance(field: Field, walls: NDArray[np.float64]) -> float:
-    """Return the smaller over the greater of the sums of squared normals of matched walls along their main axes."""
-    normal = slopes(field, walls[distances(field, walls) <= MATCH_M])
-    length = np.hypot(normal[:, 0], normal[:, 1])
-    normal = normal[length > 0.0] / length[length > 0.0, None]
-    if len(normal) < 2:
+def _hold(field: Field, walls: NDArray[np.float64]) -> float:
+    """Return the least share of matched walls that some shift by a few cells, either way along a line, would lose."""
+    row, column, inside = _cells(field, walls)
+    at = row[inside], column[inside]
+    is_matched = field.distance[at] <= MATCH_M
+    matched = walls[inside][is_matched]
+    if len(matched) == 0:
         return 0.0
-    least, most = np.linalg.eigvalsh(normal.T @ normal)
-    return float(max(0.0, least) / most)
+    lost = 1.0
+    for bearing in np.arange(_HOLD_BEARINGS) * (np.pi / _HOLD_BEARINGS):
+        shift = _HOLD_M * np.array([np.cos(bearing), np.sin(bearing)])
+        kept = sum(_compare(field, matched + way * shift).matched for way in (-1.0, 1.0)) / 2.0
+        lost = min(lost, 1.0 - kept / len(matched))
+    return lost
 
 
 def slopes(field: Field, points: NDArray[np.float64]) -> NDArray[np.float64]:

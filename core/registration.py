@@ -119,7 +119,7 @@ class Search:
         self._pixel = CELL * COARSE
         about = peer.centre
         self._about = about
-        self._points = peer.walls - about, peer.frees - about
+        self._points = peer.walls - about, peer.opens - about
         radius = max(float(np.hypot(*points.T).max(initial=0.0)) for points in self._points) + self._pixel
         self._half = math.ceil(radius / self._pixel)
         rows, columns = (math.ceil(n / COARSE) for n in reference.distance.shape)
@@ -132,7 +132,7 @@ class Search:
         seen = np.pad(near - CONTRADICTION_WEIGHT / 2.0 * against, pad)
         blocks = seen.reshape(rows, COARSE, columns, COARSE).mean(axis=(1, 3))
         wall_blocks = np.pad(walls, pad).reshape(rows, COARSE, columns, COARSE).sum(axis=(1, 3))
-        # a peer's free cells on the reference's walls, by cells of wall: as much as walls on free cells
+        # the peer's open space on the reference's walls speaks against a pose as much as walls on open space
         self._seen = np.conj(fft.rfft2(blocks.astype(np.float32), self._shape))
         self._walls = np.conj(fft.rfft2(wall_blocks.astype(np.float32), self._shape))
 

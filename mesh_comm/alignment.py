@@ -16,7 +16,7 @@ class AlignmentSettings(Settings):
     yaws_per_slice: int = Field(default=6, ge=1, description="of the 120 yaws searched, so many in one call")
     least_overlap: int = Field(default=1000, ge=1, description="cells known to both maps, or an estimate says nothing")
     least_matched: int = Field(default=100, ge=1, description="cells of wall that both maps have")
-    least_balance: float = Field(default=0.3, ge=0.0, le=1.0, description="walls across over walls along")
+    least_hold: float = Field(default=0.15, ge=0.0, le=1.0, description="walls lost by a shift along the loosest way")
     most_contradiction: float = Field(default=0.03, ge=0.0, le=1.0, description="share of walls the other map denies")
     most_rival: float = Field(default=0.5, ge=0.0, lt=1.0, description="score of the next best place over the best's")
     more_overlap: int = Field(default=300, ge=1, description="cells that an estimate must add to confirm the last")

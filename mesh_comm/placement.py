@@ -211,7 +211,7 @@ class Placements:
         return (
             fit.overlap >= settings.least_overlap
             and fit.matched >= settings.least_matched
-            and fit.balance >= settings.least_balance
+            and fit.hold >= settings.least_hold
             and fit.contradiction <= settings.most_contradiction
         )
 
