@@ -14,6 +14,7 @@ from pydantic import Field
 from imagine.core.config import Settings
 from imagine.core.errors import InputError
 from imagine.core.mapping import MapSettings
+from imagine.gcs.cell_question import cell_state
 from imagine.gcs.fleet import Fleet
 from imagine.gcs.server import GroundServer
 from imagine.gcs.snapshot import FleetSnapshot
@@ -91,7 +92,13 @@ def _loop(
 
 
 def obey(fleet: Fleet, server: GroundServer, now: float) -> None:
-    """Pass on what pilots have asked for at the page; a request that makes no sense is logged and dropped."""
+    """Pass on what pilots have asked for at the page; a request that makes no sense is logged and dropped.
+
+    Questions about cells are answered.
+    """
+    for question in server.take_questions():
+        if question.answer.set_running_or_notify_cancel():  # else nobody waits any more
+            question.answer.set_result(cell_state(fleet.provenance(question.x, question.y), now))
     for request in server.take_requests():
         try:
             fleet.command(request.command, request.target, now)

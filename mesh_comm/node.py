@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
 from imagine.core.evidence import EvidenceMap
-from imagine.core.frames import Pose
+from imagine.core.frames import IDENTITY, Pose, inverse, transform_points
 from imagine.core.lidar import LidarSpec, Scan, mask_near
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.budget import TokenBucket
@@ -22,6 +22,8 @@ from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Command, Digest, Me
 from imagine.mesh_comm.orders import Orders
 from imagine.mesh_comm.peer_book import PeerBook
 from imagine.mesh_comm.peers import Peer, PeerRecord
+from imagine.mesh_comm.placement import Place, Placements
+from imagine.mesh_comm.provenance import CellProvenance
 from imagine.mesh_comm.scan_exchange import scan_message
 from imagine.mesh_comm.seal import OVERHEAD, Opened, Rejected, Sealer
 from imagine.mesh_comm.settings import MeshSettings
@@ -63,7 +65,11 @@ class MeshNode:
         self._range_cap_m = range_cap_m
         self._sealer = sealer
         self._bucket = TokenBucket(settings.rate_bytes_per_s, settings.burst_bytes)
-        self._peers = PeerBook(settings)
+        evidence.shares_frame = settings.frame == "shared"
+        self._placements = (
+            None if evidence.shares_frame else Placements(evidence, settings.alignment, settings.launches)
+        )
+        self._peers = PeerBook(settings, evidence.placement)
         self._exchange = TileExchange(evidence, settings)
         self._maps = MapInbox(evidence, self._exchange, settings)
         self._orders = Orders(self.id, sealer.boot, settings.command_repeat_s)
@@ -120,7 +126,7 @@ class MeshNode:
             case messages.Scan():
                 peer.note_pose(message.pose, message.stamp, now)
                 if takes_maps:
-                    self._maps.take_scan(message, self._not_walls(sender, now))
+                    self._maps.take_scan(message, self._not_walls(sender, now), now)
             case Tiles():
                 if takes_maps:
                     self._take_tiles(message, peer, now)
@@ -134,7 +140,7 @@ class MeshNode:
         elif is_relayed and self.settings.protocol == "one-hop" and self.id != GROUND:
             return
         else:
-            self._maps.take_tiles(message, is_relayed and self._peers.is_live(source, now))
+            self._maps.take_tiles(message, is_relayed and self._peers.is_live(source, now), peer.id, now)
         for tile in message.tiles:  # only now that all of it has proved sound: what is noted is kept
             peer.note_held(source, tile_key(tile), tile.version)
             if source != self.id:
@@ -154,7 +160,7 @@ class MeshNode:
         if self.id == GROUND:
             raise InputError("the ground station has no scans to offer")
         self._pose = pose
-        self._maps.count_own(pose, self._range_cap_m)
+        self._maps.note_own(pose, self._range_cap_m, scan.stamp, now)
         clock = self._evidence.layers[self.id].clock
         if now < self._next_scan - _EPSILON_S or clock == self._scan_clock or not self._peers.map_listeners(now):
             return
@@ -187,13 +193,28 @@ class MeshNode:
         return self._peers.view(now)
 
     def teammates(self, now: float, leave_out: int | None = None) -> NDArray[np.float64]:
-        """Return where live peers are by now, `[n, 2]` metres, map frame: returns there are not walls."""
+        """Return where live peers are by now, `[n, 2]` metres, own frame: returns there are not walls."""
         return self._peers.positions(now, leave_out)
 
     def _not_walls(self, scanner: int, now: float) -> NDArray[np.float64]:
-        """Return where a scan of peer `scanner` sees drones: its teammates and this one."""
+        """Return where a scan of peer `scanner` sees drones, in its frame: its teammates and this one."""
+        frame = self._evidence.placement(scanner)
+        if frame is None:
+            return np.zeros((0, 2))
         others = self.teammates(now, leave_out=scanner)
-        return others if self._pose is None else np.vstack((others, [self._pose[:2]]))
+        if self._pose is not None:
+            others = np.vstack((others, [self._pose[:2]]))
+        return others if frame == IDENTITY else transform_points(inverse(frame), others)
+
+    def place(self, peer: int) -> Place:
+        """Return what is known of where a peer's frame lies in the own."""
+        if self._placements is None:
+            return Place("given", IDENTITY, 0, None)
+        return self._placements.place(peer)
+
+    def provenance(self, x: float, y: float) -> CellProvenance:
+        """Return who saw the cell at (x, y), metres of the own frame, when, and by which way that came here."""
+        return self._maps.provenance(x, y)
 
     @property
     def own_cells(self) -> int:
@@ -220,6 +241,8 @@ class MeshNode:
     def poll(self, now: float) -> list[bytes]:
         """Return the datagrams to send at `now`, most urgent first, as many as the byte budget allows."""
         out: list[bytes] = []
+        if self._placements is not None and self._placements.advance(now):
+            self._maps.note_placed()
         self._prepare(now)
         steps = [self._send_commands, self._send_status, self._send_digests]
         steps += [self._send_tiles, self._send_scan] if self._tiles_first else [self._send_scan, self._send_tiles]
