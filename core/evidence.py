@@ -210,16 +210,23 @@ class EvidenceMap:
 
         The grid may grow to hold a layer in its new place; what lies beyond the largest extent is left out.
         """
-        for source, placed in self._placed.items():
-            if source in self.layers:
-                extent = placed.extent(self.layers[source].cells, self.origin_cells)
-                if extent is not None:
-                    with suppress(InputError):  # far away: what fits is drawn
-                        self.cover(*extent)
+        stale = {
+            source: placed
+            for source, placed in self._placed.items()
+            if source in self.layers and not placed.is_current(self.layers[source].cells, self.origin_cells)
+        }
+        for source, placed in stale.items():
+            extent = placed.extent(self.layers[source].cells, self.origin_cells)
+            if extent is not None:
+                with suppress(InputError):  # far away: what fits is drawn
+                    self.cover(*extent)
+        if stale:  # the grid may have grown under all of them
+            for source, placed in self._placed.items():
+                if source in self.layers:
+                    placed.refresh(self.layers[source].cells, self.origin_cells)
         counted: dict[int, NDArray[np.int8]] = {}
         for source, layer in self.layers.items():
             if source in self._placed:
-                self._placed[source].refresh(layer.cells, self.origin_cells)
                 counted[source] = self._placed[source].cells
             elif self.placement(source) is not None:
                 counted[source] = layer.cells

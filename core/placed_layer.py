@@ -25,6 +25,10 @@ class PlacedLayer:
         self._drawn = np.zeros((0, 0), np.int8)
         self._origin = (0, 0)
 
+    def is_current(self, source: NDArray[np.int8], origin_cells: tuple[int, int]) -> bool:
+        """Tell whether `source` is as it was drawn last, so that `refresh` would change nothing."""
+        return origin_cells == self._origin and np.array_equal(source, self._drawn)
+
     def refresh(self, source: NDArray[np.int8], origin_cells: tuple[int, int]) -> None:
         """Redraw what changed of `source`, int8 `[rows, columns]` of whole tiles, its first cell at `origin_cells`.
 

@@ -125,7 +125,8 @@ def attempt_pair(
     settings: AlignmentSettings,
 ) -> Trial:
     """Let one drone search for the other, who began `late` ticks later, every period of their flights."""
-    frames = [compose(member.pose(0), _anywhere(rng)) for member in (one, other)]
+    shift_m = 5.0 if settings.launch_radius_m is None else 0.0  # else frames begin where the drones do
+    frames = [compose(member.pose(0), _anywhere(rng, shift_m)) for member in (one, other)]
     evidence = EvidenceMap(1, half_extent_m=25.6, max_extent_m=256.0, shares_frame=False)
     placements = Placements(evidence, settings)
     truth = relative(*frames) if kind != "two levels" else None
@@ -144,8 +145,8 @@ def attempt_pair(
     return Trial(one.flights.level, other.flights.level, kind, drift, tuple(looks))
 
 
-def _anywhere(rng: np.random.Generator) -> Pose:
-    x, y, yaw = rng.uniform((-5.0, -5.0, -math.pi), (5.0, 5.0, math.pi)).tolist()
+def _anywhere(rng: np.random.Generator, shift_m: float) -> Pose:
+    x, y, yaw = rng.uniform((-shift_m, -shift_m, -math.pi), (shift_m, shift_m, math.pi)).tolist()
     return Pose(x, y, yaw)
 
 
@@ -168,14 +169,23 @@ def _look(evidence: EvidenceMap, placements: Placements, truth: Pose | None, now
     return Look(now, share, pose is not None, error_m, error_rad, cpu_s)
 
 
-def run(pairs: int, seed: int, levels: tuple[str, ...], progress: Callable[[str], None]) -> list[Trial]:
-    """Fly the levels with drift and without, and try so many pairs of their drones."""
+def run(
+    pairs: int, seed: int, levels: tuple[str, ...], launch_radius_m: float | None, progress: Callable[[str], None]
+) -> list[Trial]:
+    """Fly the levels with drift and without, and try so many pairs of their drones.
+
+    With `launch_radius_m` all pairs are of one flight, and it is known that they began so near to each other.
+    """
+    kinds, shares = np.array(["one flight", "two flights", "two levels"]), (0.35, 0.35, 0.3)
+    if launch_radius_m is not None:
+        shares = (1.0, 0.0, 0.0)
+    settings = AlignmentSettings(launch_radius_m=launch_radius_m)
     rng = np.random.default_rng(seed)
     flown = {(level, drift): fly(level, drift, 4, seed + drift) for level in levels for drift in (False, True)}
     trials = []
     for number in range(pairs):
         level, drift = levels[number % len(levels)], bool(number // len(levels) % 2)
-        kind: Kind = rng.choice(np.array(["one flight", "two flights", "two levels"]), p=(0.35, 0.35, 0.3)).item()
+        kind: Kind = rng.choice(kinds, p=shares).item()
         world, second = rng.choice(4, 2, replace=False).tolist()
         one = Member(flown[level, drift], world, 0)
         if kind == "two levels":
@@ -183,7 +193,7 @@ def run(pairs: int, seed: int, levels: tuple[str, ...], progress: Callable[[str]
             other = Member(flown[elsewhere[int(rng.integers(len(elsewhere)))], drift], second, 1)
         else:
             other = Member(flown[level, drift], world if kind == "one flight" else second, 1)
-        trial = attempt_pair(one, other, int(rng.integers(0, 100)), drift, kind, rng, AlignmentSettings())
+        trial = attempt_pair(one, other, int(rng.integers(0, 100)), drift, kind, rng, settings)
         trials.append(trial)
         progress(f"{number + 1}/{pairs} {trial.level} {trial.other} {kind}{' WRONG' if trial.is_wrong else ''}")
     return trials
@@ -243,9 +253,16 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=210)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--levels", default=",".join(LEVELS))
+    parser.add_argument("--launch-radius", type=float, help="metres; only pairs of one flight, known to begin so near")
     parser.add_argument("--json", type=Path)
     flags = parser.parse_args()
-    trials = run(flags.pairs, flags.seed, tuple(flags.levels.split(",")), lambda text: print(text, flush=True))
+    trials = run(
+        flags.pairs,
+        flags.seed,
+        tuple(flags.levels.split(",")),
+        flags.launch_radius,
+        lambda text: print(text, flush=True),
+    )
     results = summary(trials)
     for name, figure in results.items():
         print(f"{name:32} {figure['value']:10} {figure['unit']}", {k: v for k, v in figure.items() if k != "value"})

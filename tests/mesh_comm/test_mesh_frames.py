@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from frames_room import FLAT, SQUARE, Stranger, share
 from numpy.typing import NDArray
-from radio_room import exchange, make_drone, same_layers
+from radio_room import Drone, exchange, make_drone, same_layers
 
 from imagine.core.frames import IDENTITY, Pose, compose, inverse, relative, transform_points, wrap_angle
 from imagine.core.raster import CELL
@@ -128,3 +128,32 @@ def test_a_shared_frame_is_the_identity() -> None:
 def test_a_layout_and_its_frame_go_together(settings: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="layout"):
         MeshSettings.model_validate(settings)
+
+
+def test_the_ground_shows_all_in_the_frame_of_the_first_drone_it_hears() -> None:
+    team = strangers(frame="unknown")
+    ground = make_drone(0, frame="unknown")
+    for second in range(40):
+        for tick in range(10):
+            now = second + tick / 10
+            for stranger in team:
+                stranger.fly(now)
+            talk = [(drone, drone.poll(now)) for drone in (team[0].drone, team[1].drone, ground)]
+            for sender, datagrams in talk:
+                for other in (team[0].drone, team[1].drone, ground):
+                    for datagram in datagrams if other is not sender else []:
+                        other.node.receive(datagram, now)
+    anchor, other_id = (1, 2) if ground.node.place(1).pose == IDENTITY else (2, 1)
+    assert ground.node.place(anchor).pose == IDENTITY
+    pose = ground.node.place(other_id).pose
+    assert pose is not None
+    true = relative(FRAMES[anchor], FRAMES[other_id])
+    assert math.hypot(pose.x - true.x, pose.y - true.y) < 0.1
+    assert ground.node.peers(40.0)[other_id].pose is not None
+    assert believed_share(ground) > 0.9
+
+
+def believed_share(ground: Drone) -> float:
+    """How much of the better known drone's map the ground shows, in cells."""
+    held = max(np.count_nonzero(layer.cells) for layer in ground.evidence.layers.values())
+    return float(np.count_nonzero(ground.evidence.belief()) / held)
