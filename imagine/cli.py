@@ -457,12 +457,22 @@ def doctor(json_file: JsonFile = None) -> None:
 
 
 @app.command()
-def keygen(out: Annotated[Path, typer.Argument(help="where the key goes; the file must not exist")]) -> None:
-    """Make a key for a swarm's radio."""
-    from imagine.mesh_comm.keys import write_new_key
+def keygen(
+    out: Annotated[Path, typer.Argument(help="the drones' key file; it must not exist, or with --rotate must")],
+    ground: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="the ground station's file: it alone can then give orders")
+    ] = None,
+    rotate: Annotated[bool, typer.Option("--rotate", help="add a new key to the file, and let the others end")] = False,
+    after: Annotated[float, typer.Option(min=0.0, max=8760.0, help="hours until the new key sends")] = 24.0,
+    overlap: Annotated[float, typer.Option(min=0.0, max=8760.0, help="hours the others are heard after that")] = 24.0,
+) -> None:
+    """Make a key for a swarm's radio, or change it."""
+    from imagine.keygen_command import make_keys, renew_keys
 
-    write_new_key(out)
-    print(f"{out}: a new key, readable by you alone; copy it to every drone and the ground station")
+    if rotate:
+        renew_keys(out, ground, after, overlap)
+    else:
+        make_keys(out, ground)
 
 
 def _needs(package: str, extra: str) -> None:
