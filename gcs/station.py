@@ -20,9 +20,12 @@ from imagine.gcs.server import GroundServer
 from imagine.gcs.snapshot import FleetSnapshot
 from imagine.mesh_comm.keyring import KeyRing
 from imagine.mesh_comm.keys import start_sealer
-from imagine.mesh_comm.links import UdpBroadcastLink, UdpModemLink, open_link
+from imagine.mesh_comm.link_url import FORMS
+from imagine.mesh_comm.links import open_link
 from imagine.mesh_comm.messages import GROUND
 from imagine.mesh_comm.settings import MeshSettings
+from imagine.mesh_comm.udp_modem import UdpModemLink
+from imagine.mesh_comm.udp_network import UdpNetworkLink
 
 logger = logging.getLogger(__name__)
 
@@ -34,9 +37,7 @@ _CLAIMING_S = 2.0
 class StationSettings(Settings):
     """Where the ground station meets the swarm, and where it shows its page."""
 
-    mesh: str = Field(
-        default="udpbcast://239.255.77.77:17700", description="udpbcast:// or udpout:// link of the swarm"
-    )
+    mesh: str = Field(default="udpbcast://239.255.77.77:17700", description=f"link of the swarm: {FORMS}")
     host: str = Field(default="127.0.0.1", description="address the page is served at")
     port: int = Field(default=8770, ge=0, le=65535, description="port of the page; 0 takes any free one")
     boot_file: str = Field(default="~/.imagine/ground.boot", description="remembers the boot number between starts")
@@ -53,8 +54,8 @@ def run_station(
 ) -> FleetSnapshot:
     """Run the ground station until `stop` is set; return its last snapshot.
 
-    `keys` are the swarm's (`mesh_comm.keys.find_keys`). `on_start` gets the page's address, `on_snapshot` five snapshots
-    a second, both from this thread. Raises InputError on a link or port that cannot be opened, WorkError
+    `keys` are the swarm's (`mesh_comm.keys.find_keys`). `on_start` gets the page's address, `on_snapshot` five
+    snapshots a second, both from this thread. Raises InputError on a link or port that cannot be opened, WorkError
     once another ground station is known to be on the air: drones would heed only one of the two.
     """
     sealer = start_sealer(keys, GROUND, Path(settings.boot_file), time.time())
@@ -70,7 +71,7 @@ def run_station(
 
 def _loop(
     fleet: Fleet,
-    link: UdpModemLink | UdpBroadcastLink,
+    link: UdpModemLink | UdpNetworkLink,
     server: GroundServer,
     on_snapshot: Callable[[FleetSnapshot], None],
     stop: threading.Event,

@@ -34,9 +34,7 @@ def write_new_keys(path: Path, ground_path: Path | None = None) -> KeyRing:
     return ring
 
 
-def rotate_keys(
-    path: Path, ground_path: Path | None, unix_time_s: float, after_s: float, overlap_s: float
-) -> KeyRing:
+def rotate_keys(path: Path, ground_path: Path | None, unix_time_s: float, after_s: float, overlap_s: float) -> KeyRing:
     """Add a new key to a key file, and the same to the ground's; return the drones' ring.
 
     The new key sends in `after_s`; the others are accepted for `overlap_s` from then on. Raises InputError if a file

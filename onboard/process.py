@@ -19,7 +19,9 @@ from types import FrameType
 
 from imagine.core.errors import InputError, WorkError
 from imagine.core.lidar import Scan
-from imagine.mesh_comm.links import MeshLink, UdpBroadcastLink, UdpModemLink, open_link
+from imagine.mesh_comm.links import MeshLink, open_link
+from imagine.mesh_comm.udp_modem import UdpModemLink
+from imagine.mesh_comm.udp_network import UdpNetworkLink
 from imagine.onboard.autopilot import Autopilot
 from imagine.onboard.build import build_runner, load_policy, mesh_sealer, warm_up
 from imagine.onboard.lidar_source import LidarSource
@@ -95,7 +97,9 @@ def run_drone(settings: DroneSettings) -> int:
             dropped = loop.record.dropped
             dropped.update(autopilot.dropped)
             dropped.update(lidar.dropped)
-            dropped["mesh_lost"] += link.lost if isinstance(link, (UdpModemLink, UdpBroadcastLink)) else 0
+            dropped.update(mesh_lost=0, mesh_oversize=0)
+            if isinstance(link, UdpModemLink | UdpNetworkLink):
+                dropped.update(mesh_lost=link.lost, mesh_oversize=link.oversize)
             try:
                 loop.leave_behind(settings.report, settings.map_out)
             except (InputError, WorkError) as error:  # what befell the flight itself is told first
