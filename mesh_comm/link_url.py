@@ -39,7 +39,12 @@ def parse_link_url(text: str) -> LinkUrl:
     listen = _parse_port(text, options["listen"]) if "listen" in options else None
     if scheme != "udpout" and listen is None:
         listen = targets[0][1]
-    return LinkUrl(text, scheme, targets, options.get("interface"), listen)
+    named = {host.partition("%")[2] for host, _ in targets} | {options.get("interface", "")}  # an address may name it
+    named.discard("")
+    if len(named) > 1:
+        raise InputError(f"{text}: names several interfaces: {', '.join(sorted(named))}")
+    targets = tuple((host.partition("%")[0], port) for host, port in targets)
+    return LinkUrl(text, scheme, targets, next(iter(named), None), listen)
 
 
 def parse_udp_url(url: str, scheme: str, named: str | None = None) -> tuple[str, int]:

@@ -45,8 +45,8 @@ def resolve(url: LinkUrl, host: str, port: int) -> tuple[socket.AddressFamily, S
     family, _, _, _, reached = min(found, key=lambda each: each[0] != socket.AF_INET)
     address: SocketAddress = reached
     if family == socket.AF_INET6:
-        ip, scope = ipaddress.IPv6Address(str(address[0]).partition("%")[0]), int(address[3])
-        if (ip.is_link_local or ip.is_multicast) and not scope:
+        ip, scope = ipaddress.IPv6Address(str(address[0])), 0
+        if ip.is_link_local or ip.is_multicast:
             scope = find_interface(url)
             if not scope and (ip.is_link_local or int(ip) >> 112 == 0xFF02):
                 raise InputError(f"{url.text}: {host} exists on every interface: name one, ?interface=NAME; {_there()}")

@@ -43,7 +43,7 @@ def _unshared(script: str, **environment: str) -> subprocess.CompletedProcess[st
 def _may_make_namespaces() -> None:
     if not all(map(shutil.which, ("unshare", "nsenter", "ip"))):
         pytest.skip("this machine has no unshare, nsenter or ip")
-    probe = _unshared("ip link add a type veth peer name b && unshare -n true")
+    probe = _unshared("ip link add radio0 type veth peer name radio1 && unshare -n true")
     if probe.returncode != 0:
         pytest.skip(f"no network namespaces for us here: {probe.stderr.strip()}")
 

@@ -247,7 +247,10 @@ def test_no_url_breaks_more_than_itself(text: str) -> None:
 
 
 def test_an_ipv6_address_may_carry_its_interface() -> None:
-    assert parse_link_url("udpbcast://[ff02::4d:31%25wlan0]:5000").targets == (("ff02::4d:31%wlan0", 5000),)
+    url = parse_link_url("udpbcast://[ff02::4d:31%25wlan0]:5000")
+    assert (url.targets, url.interface) == ((("ff02::4d:31", 5000),), "wlan0")
+    with pytest.raises(InputError, match="several interfaces: eth0, wlan0"):
+        parse_link_url("udpbcast://[ff02::4d:31%25wlan0]:5000?interface=eth0")
 
 
 def test_an_unknown_host_is_named() -> None:
