@@ -159,6 +159,7 @@ def format_ring(ring: KeyRing) -> str:
 
 
 def _parse_key(words: list[str], where: str) -> SwarmKey:
+    secret = _parse_digits(words[0], where)
     times: dict[str, float] = {}
     for word in words[1:]:
         name, _, value = word.partition("=")
@@ -169,7 +170,7 @@ def _parse_key(words: list[str], where: str) -> SwarmKey:
         except ValueError as error:
             raise InputError(f"{where}: {name} is no time like 2026-11-25T10:00:00Z") from error
     return SwarmKey(
-        _parse_digits(words[0], where),
+        secret,
         times.get("made", -math.inf),
         times.get("sends-from", -math.inf),
         times.get("accepted-until", math.inf),
