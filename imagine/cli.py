@@ -413,6 +413,18 @@ def bench_train(
     bench_train_and_show(config, worlds, drones, rounds, quick, tuple(overrides or ()), json_file)
 
 
+@bench_app.command("seal")
+def bench_seal(
+    datagrams: Annotated[int, typer.Option(min=100, max=1_000_000, help="of each kind")] = 20_000,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure how many datagrams a core seals, opens and refuses a second."""
+    check_outputs(json_file)
+    from imagine.bench_seal_command import bench_seal_and_show
+
+    bench_seal_and_show(datagrams, json_file)
+
+
 @bench_app.command("twin")
 def bench_twin(
     level: Annotated[str, typer.Option(help="a level, 0 to 6, or a YAML file")] = "6",
