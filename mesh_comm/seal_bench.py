@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from imagine.mesh_comm.keyring import KEY_BYTES, KeyRing, SwarmKey, ground_public
@@ -35,20 +36,28 @@ def bench_seal(datagrams: int = 20_000, rounds: int = 5) -> dict[str, dict[str, 
             senders = [make(own, number) for own in range(1, _SENDERS + 1)]
             sealed: list[bytes] = []
             each = [senders[index % _SENDERS] for index in range(datagrams)]
-            rates = [_rate(lambda sender, p=payload, s=sealed: s.append(sender.seal(p, 0.0)), each)]
+            rates = [_rate(partial(_seal, payload, sealed), each)]
             opener = make(254)
-            rates.append(_rate(lambda datagram, by=opener: by.open(datagram, 0.0), sealed))
-            rates.append(_rate(lambda datagram, by=opener: _refuse(by, datagram), sealed))  # replays
+            rates.append(_rate(partial(_open, opener), sealed))
+            rates.append(_rate(partial(_refuse, opener), sealed))  # replays
             forged = [datagram[:-1] + bytes((datagram[-1] ^ 1,)) for datagram in sealed]
-            rates.append(_rate(lambda datagram, by=opener: _refuse(by, datagram), forged))
+            rates.append(_rate(partial(_refuse, opener), forged))
             best = list(map(max, best, rates))
         for what, rate in zip(("seal", "open", "refuse_replayed", "refuse_forged"), best, strict=True):
             found[f"{what}_{name}"] = {"value": rate, "unit": "datagrams/s of CPU time", "bytes": size + OVERHEAD}
     ground, drone = make(0), make(1)
     signed = [ground.seal(bytes(_SCAN_BYTES), 0.0) for _ in range(datagrams // 20)]
-    rate = _rate(lambda datagram: drone.open(datagram, 0.0), signed)
+    rate = _rate(partial(_open, drone), signed)
     found["open_signed"] = {"value": rate, "unit": "datagrams/s of CPU time", "bytes": len(signed[0])}
     return found
+
+
+def _seal(payload: bytes, sealed: list[bytes], sender: Sealer) -> None:
+    sealed.append(sender.seal(payload, 0.0))
+
+
+def _open(opener: Sealer, datagram: bytes) -> None:
+    opener.open(datagram, 0.0)
 
 
 def _refuse(opener: Sealer, datagram: bytes) -> None:

@@ -1,4 +1,4 @@
-"""`imagine keygen` makes and changes key files; `imagine doctor` and `imagine bench seal` look at what rests on them."""
+"""`imagine keygen` makes and changes key files; the doctor and the bench look at what rests on them."""
 
 from __future__ import annotations
 
