@@ -25,13 +25,12 @@ from imagine.mesh_comm.peers import Peer, PeerRecord
 from imagine.mesh_comm.placement import Place, Placements
 from imagine.mesh_comm.provenance import CellProvenance
 from imagine.mesh_comm.scan_exchange import scan_message
-from imagine.mesh_comm.seal import OVERHEAD, Opened, Rejected, Sealer
+from imagine.mesh_comm.seal import Opened, Rejected, Sealer
 from imagine.mesh_comm.settings import MeshSettings
 from imagine.mesh_comm.tile_exchange import TileExchange
 
 __all__ = ["MeshNode", "MeshSettings", "Peer"]
 
-_MAX_PAYLOAD = MAX_DATAGRAM - OVERHEAD
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4  # of a longer digest, this many go out per period, in turn
 _EPSILON_S = 1e-6  # periods are whole ticks: rounding of their sum must not cost a tick
@@ -64,6 +63,7 @@ class MeshNode:
         self._lidar = lidar
         self._range_cap_m = range_cap_m
         self._sealer = sealer
+        self._max_payload = MAX_DATAGRAM - sealer.overhead
         self._bucket = TokenBucket(settings.rate_bytes_per_s, settings.burst_bytes)
         evidence.shares_frame = settings.frame == "shared"
         self._placements = (
@@ -88,12 +88,9 @@ class MeshNode:
     def receive(self, datagram: bytes, now: float) -> None:
         """Take in whatever the radio heard. Never raises on its content: what is wrong is counted in `stats`."""
         try:
-            opened = self._sealer.open(datagram)
+            opened = self._sealer.open(datagram, now)
         except Rejected:
             return  # counted by the sealer
-        if opened.sender == self.id:
-            self._dropped["own-id"] += 1  # another node runs under this id, or an earlier life of this one
-            return
         try:
             message = messages.decode(opened.payload)
         except InputError as error:
@@ -166,7 +163,7 @@ class MeshNode:
             return
         masked = mask_near(scan.ranges, self._lidar, pose, self.teammates(now), self.settings.mask_radius_m)
         offered = Scan(scan.stamp, masked)
-        self._scan = scan_message(self.id, clock, pose, offered, self._lidar, self._range_cap_m, _MAX_PAYLOAD)
+        self._scan = scan_message(self.id, clock, pose, offered, self._lidar, self._range_cap_m, self._max_payload)
 
     def set_status(self, status: Status) -> None:
         """Set what the next status message tells; cells, bytes, links, rejections and command are filled in."""
@@ -232,6 +229,11 @@ class MeshNode:
         return self._maps.map_cells
 
     @property
+    def has_namesake(self) -> bool:
+        """Whether another node is known to have used this node's id since this one started; neither may go on."""
+        return self._sealer.has_namesake
+
+    @property
     def stats(self) -> dict[str, int]:
         """How many datagrams were dropped, by reason."""
         return dict(sorted((self._sealer.rejected + self._dropped).items()))
@@ -244,7 +246,7 @@ class MeshNode:
         if self._placements is not None and self._placements.advance(now):
             self._maps.note_placed()
         self._prepare(now)
-        steps = [self._send_commands, self._send_status, self._send_digests]
+        steps = [self._send_claim, self._send_commands, self._send_status, self._send_digests]
         steps += [self._send_tiles, self._send_scan] if self._tiles_first else [self._send_scan, self._send_tiles]
         for step in steps:
             if not step(out, now):
@@ -264,13 +266,23 @@ class MeshNode:
         if has_readers and now >= self._next_digest - _EPSILON_S:
             self._next_digest = now + self.settings.digest_period_s
             held = {source: self._evidence.versions(source) for source in self._evidence.layers if source != self.id}
-            parts = digests(now, held, _MAX_PAYLOAD)
+            parts = digests(now, held, self._max_payload)
             turn = self._digest_turn % len(parts)
             self._digests = deque((parts[turn:] + parts[:turn])[:_DIGEST_DATAGRAMS])
             self._digest_turn = turn + _DIGEST_DATAGRAMS
         if self.id != GROUND and now >= self._next_plan - _EPSILON_S:
             self._next_plan = now + _PLAN_PERIOD_S
             self._exchange.plan([peer for peer in self._peers.map_listeners(now) if np.isfinite(peer.digest_at)], now)
+
+    def _send_claim(self, out: list[bytes], now: float) -> bool:
+        claim = self._sealer.claim(now)
+        if claim is None:
+            return True
+        if not self._bucket.take(len(claim), now):  # lost: the next datagram of the namesake asks for another
+            return False
+        out.append(claim)
+        self.bytes_sent["status"] += len(claim)
+        return True
 
     def _send_commands(self, out: list[bytes], now: float) -> bool:
         relays = self._orders.relays
@@ -321,7 +333,7 @@ class MeshNode:
         return True
 
     def _send_tiles(self, out: list[bytes], now: float) -> bool:
-        while (message := self._exchange.next_message(_MAX_PAYLOAD)) is not None:
+        while (message := self._exchange.next_message(self._max_payload)) is not None:
             if not self._send(message, "tile", out, now):
                 return False
             self._exchange.note_sent(message, now)
@@ -330,9 +342,9 @@ class MeshNode:
     def _send(self, message: Message, kind: str, out: list[bytes], now: float) -> bool:
         """Seal a message and put it out if the budget allows; tell whether it did."""
         payload = messages.encode(message)
-        size = len(payload) + OVERHEAD
+        size = len(payload) + self._sealer.overhead
         if not self._bucket.take(size, now):
             return False
-        out.append(self._sealer.seal(payload))
+        out.append(self._sealer.seal(payload, now))
         self.bytes_sent[kind] += size
         return True
