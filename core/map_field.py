@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from imagine.core.frames import Pose, inverse, transform_points
 from imagine.core.raster import CELL
@@ -70,6 +69,8 @@ def field_of(cells: NDArray[np.int8], origin_cells: tuple[int, int]) -> Field | 
     wall, clear = window >= WALL_UNITS, window <= FREE_UNITS
     x0 = (origin_cells[0] + column0 - margin) * CELL
     y0 = (origin_cells[1] + row0 - margin) * CELL
+    from scipy import ndimage  # here: a drone that shares its team's frame starts without it
+
     distance = (ndimage.distance_transform_edt(~wall) * CELL).astype(np.float32)
 
     def centres(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
