@@ -3,11 +3,15 @@
 Merging takes the newer version of a tile and the belief is the clamped sum over sources, computed when read. So
 merging is idempotent, commutative and associative (a state-based CRDT with single writers, Shapiro et al. 2011):
 order, duplicates, loss and relays cannot count evidence twice.
+
+Every layer is kept in its source's own frame, exactly as it was sent. A placement says where that frame lies in the
+drone's; a layer without one is held, served and merged, but no part of the belief.
 """
 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
-from imagine.core.frames import Pose
+from imagine.core.frames import IDENTITY, Pose
 from imagine.core.lidar import LidarSpec, Scan
+from imagine.core.placed_layer import PlacedLayer
 from imagine.core.raster import CELL, LIMIT, TILE, integrate_scan, sum_layers
 
 MAX_TILES = 160
@@ -58,8 +63,13 @@ class EvidenceMap:
     Sources are small integers (drone ids). Metres and radians, map frame.
     """
 
-    def __init__(self, own: int, half_extent_m: float = 12.8, max_extent_m: float = 128.0) -> None:
+    def __init__(
+        self, own: int, half_extent_m: float = 12.8, max_extent_m: float = 128.0, shares_frame: bool = True
+    ) -> None:
         """Make an empty map for drone `own`, reserving `half_extent_m` around the origin.
+
+        With `shares_frame` all sources draw in one frame, unless `place` says otherwise; without, nobody's frame is
+        known but the own.
 
         It grows to at most `max_extent_m` along an axis: a bound on memory, and on the time a tick takes, whatever
         peers send. Raises InputError if that is less than is reserved, or more than 512 m.
@@ -75,6 +85,9 @@ class EvidenceMap:
         self.corner = TileKey(-tiles, -tiles)
         self.tile_rows = self.tile_columns = 2 * tiles
         self.layers: dict[int, Layer] = {own: Layer.empty(self.tile_rows, self.tile_columns)}
+        self.shares_frame = shares_frame
+        self._placements: dict[int, Pose | None] = {own: IDENTITY}
+        self._placed: dict[int, PlacedLayer] = {}
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -173,10 +186,60 @@ class EvidenceMap:
         layer.clock = max(layer.clock, version)
         return True
 
+    def place(self, source: int, pose: Pose | None) -> None:
+        """Say where a source's frame lies in the drone's own (metres, radians), or (None) that it is not known.
+
+        Raises InputError on the drone itself and on a pose that is not finite.
+        """
+        if source == self.own:
+            raise InputError(f"source {source} is this drone itself: its frame is the map's")
+        if pose is not None and not all(map(math.isfinite, pose)):
+            raise InputError(f"placement {tuple(pose)} of source {source} is not finite")
+        self._placements[source] = pose
+        if pose is None or pose == IDENTITY:
+            self._placed.pop(source, None)
+        elif source not in self._placed or self._placed[source].pose != pose:
+            self._placed[source] = PlacedLayer(pose)
+
+    def placement(self, source: int) -> Pose | None:
+        """Return where a source's frame lies in the own, metres and radians; None while that is not known."""
+        return self._placements.get(source, IDENTITY if self.shares_frame else None)
+
+    def placed(self) -> dict[int, NDArray[np.int8]]:
+        """Return what of every placed source counts in the belief, int8 `[rows, columns]` on the own grid; views.
+
+        The grid may grow to hold a layer in its new place; what lies beyond the largest extent is left out.
+        """
+        stale = {
+            source: placed
+            for source, placed in self._placed.items()
+            if source in self.layers and not placed.is_current(self.layers[source].cells, self.origin_cells)
+        }
+        for source, placed in stale.items():
+            extent = placed.extent(self.layers[source].cells, self.origin_cells)
+            if extent is not None:
+                with suppress(InputError):  # far away: what fits is drawn
+                    self.cover(*extent)
+        if stale:  # the grid may have grown under all of them
+            for source, placed in self._placed.items():
+                if source in self.layers:
+                    placed.refresh(self.layers[source].cells, self.origin_cells)
+        counted: dict[int, NDArray[np.int8]] = {}
+        for source, layer in self.layers.items():
+            if source in self._placed:
+                counted[source] = self._placed[source].cells
+            elif self.placement(source) is not None:
+                counted[source] = layer.cells
+        return counted
+
     def belief(self) -> NDArray[np.int8]:
-        """Return the clamped sum over sources, int8 `[rows, columns]`: negative free, positive occupied, 0 unknown."""
+        """Return the clamped sum over placed sources, int8 `[rows, columns]`: negative free, positive occupied.
+
+        0 is unknown. The grid may grow first, see `placed`: ask for `origin_cells` afterwards.
+        """
+        layers = list(self.placed().values())
         out = np.empty(self.shape, np.int8)
-        sum_layers(np.stack([layer.cells for layer in self.layers.values()]), out)
+        sum_layers(np.stack(layers), out)
         return out
 
     def cover(self, x_min: float, y_min: float, x_max: float, y_max: float) -> None:

@@ -14,6 +14,7 @@ from imagine.gcs.snapshot import DroneView, FleetEvent, FleetSnapshot, Severity
 from imagine.gcs.track import Track
 from imagine.mesh_comm.messages import ACTIONS, GROUND
 from imagine.mesh_comm.node import MeshNode, MeshSettings, Peer
+from imagine.mesh_comm.provenance import CellProvenance
 from imagine.mesh_comm.seal import Sealer
 
 EVENTS_KEPT = 200
@@ -78,6 +79,10 @@ class Fleet:
         told = {target} if target else {drone for drone, track in self._tracks.items() if not track.lost}
         self._orders.give(action, target, told, nonce, at)
         self._log(at, target, "info", f"pilot: {action}")
+
+    def provenance(self, x: float, y: float) -> CellProvenance:
+        """Return who saw the cell at (x, y), metres, when, and by which way that came to the ground."""
+        return self.node.provenance(x, y)
 
     def note(self, drone: int, text: str, lost: bool = False) -> None:
         """Attach what someone else knows of a drone, such as why its process ended; an empty text takes it away.

@@ -14,12 +14,13 @@ import threading
 import time
 from contextlib import suppress
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlsplit
 
 import msgspec
 
 from imagine.core.errors import InputError, WorkError
+from imagine.gcs.cell_question import CellQuestion, cell_question
 from imagine.gcs.snapshot import FleetSnapshot
 from imagine.gcs.wire import ClientView, CommandRequest, decode_request, state_since
 
@@ -31,11 +32,13 @@ if TYPE_CHECKING:  # the web libraries are an extra: a drone runs without them
     from starlette.websockets import WebSocket
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 PUSH_PERIOD_S = 0.2
 _START_DEADLINE_S = 10.0
 _STOP_DEADLINE_S = 5.0
 _QUEUE_LIMIT = 64
+_ANSWER_DEADLINE_S = 2.0
 _WAITING = b'{"waiting":true}'
 _ASSETS = {
     "": ("index.html", "text/html; charset=utf-8"),
@@ -60,7 +63,8 @@ _HEADERS = {
 class GroundServer:
     """Serves the ground station's page at `url` between `start()` and `stop()`.
 
-    `publish` hands over the newest snapshot; `take_requests` returns what pilots have asked for since the last call.
+    `publish` hands over the newest snapshot; `take_requests` and `take_questions` return what pilots have asked for
+    since the last call.
     Port 0 takes any free port. Raises InputError if the web libraries are missing or the address cannot be taken.
     """
 
@@ -70,6 +74,7 @@ class GroundServer:
         self._snapshot: FleetSnapshot | None = None
         self._published = 0.0
         self._requests: queue.Queue[CommandRequest] = queue.Queue(_QUEUE_LIMIT)
+        self._questions: queue.Queue[CellQuestion] = queue.Queue(_QUEUE_LIMIT)
         self._server: uvicorn.Server | None = None
         self._thread: threading.Thread | None = None
         self._failure: BaseException | None = None
@@ -88,11 +93,11 @@ class GroundServer:
 
     def take_requests(self) -> list[CommandRequest]:
         """Return the commands asked for since the last call, oldest first."""
-        taken: list[CommandRequest] = []
-        with suppress(queue.Empty):
-            while True:
-                taken.append(self._requests.get_nowait())
-        return taken
+        return _drain(self._requests)
+
+    def take_questions(self) -> list[CellQuestion]:
+        """Return the cells asked about since the last call, oldest first; each waits for its answer to be set."""
+        return _drain(self._questions)
 
     def start(self) -> None:
         """Bind the port and serve; return once the page answers. Raises InputError, or WorkError past the deadline."""
@@ -164,7 +169,7 @@ class GroundServer:
     # -- the application ----------------------------------------------------------------------------------------------
 
     def app(self) -> Starlette:
-        """Return the ASGI application: page, `/api/state` and `/ws`."""
+        """Return the ASGI application: page, `/api/state`, `/api/provenance` and `/ws`."""
         _uvicorn()
         from starlette.applications import Starlette
         from starlette.routing import Route, WebSocketRoute
@@ -174,6 +179,7 @@ class GroundServer:
             routes=[
                 WebSocketRoute("/ws", self._websocket),
                 Route("/api/state", self._state),
+                Route("/api/provenance", self._provenance),
                 Route("/{name:path}", _asset),
             ]
         )
@@ -195,6 +201,22 @@ class GroundServer:
         version = int(since) if since.isdecimal() else self._snapshot.map.version
         message = self._message(self._snapshot, ClientView(map_version=version))
         return Response(message, media_type="application/json", headers={"Cache-Control": "no-store"})
+
+    async def _provenance(self, request: Request) -> Response:
+        from starlette.responses import Response
+
+        if not _trusted_host(request.headers.get("host", "")):
+            return Response("unknown host\n", 403)
+        try:
+            question = cell_question(request.query_params)
+            self._questions.put_nowait(question)
+            answer = await asyncio.wait_for(asyncio.wrap_future(question.answer), _ANSWER_DEADLINE_S)
+        except InputError as error:
+            return Response(f"{error}\n", 400)
+        except (queue.Full, TimeoutError):
+            return Response("the flight's loop does not answer\n", 503)
+        headers = {"Cache-Control": "no-store"}
+        return Response(msgspec.json.encode(answer), media_type="application/json", headers=headers)
 
     async def _websocket(self, socket_: WebSocket) -> None:
         from starlette.websockets import WebSocketDisconnect
@@ -238,6 +260,14 @@ class GroundServer:
             except queue.Full:
                 answer = {"refused": "too many commands are waiting: the flight's loop does not take them"}
             await socket_.send_text(msgspec.json.encode(answer).decode())
+
+
+def _drain(waiting: queue.Queue[T]) -> list[T]:
+    taken: list[T] = []
+    with suppress(queue.Empty):
+        while True:
+            taken.append(waiting.get_nowait())
+    return taken
 
 
 async def _asset(request: Request) -> Response:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import select
 import threading
 import time
@@ -12,29 +13,32 @@ from pathlib import Path
 from pydantic import Field
 
 from imagine.core.config import Settings
-from imagine.core.errors import InputError
+from imagine.core.errors import InputError, WorkError
 from imagine.core.mapping import MapSettings
+from imagine.gcs.cell_question import cell_state
 from imagine.gcs.fleet import Fleet
 from imagine.gcs.server import GroundServer
 from imagine.gcs.snapshot import FleetSnapshot
-from imagine.mesh_comm.keys import next_boot_number
-from imagine.mesh_comm.links import UdpBroadcastLink, UdpModemLink, open_link
+from imagine.mesh_comm.keyring import KeyRing
+from imagine.mesh_comm.keys import start_sealer
+from imagine.mesh_comm.link_url import FORMS
+from imagine.mesh_comm.links import open_link
 from imagine.mesh_comm.messages import GROUND
-from imagine.mesh_comm.seal import Sealer
 from imagine.mesh_comm.settings import MeshSettings
+from imagine.mesh_comm.udp_modem import UdpModemLink
+from imagine.mesh_comm.udp_network import UdpNetworkLink
 
 logger = logging.getLogger(__name__)
 
 _LOOP_S = 0.05
 _SNAPSHOT_S = 0.2
+_CLAIMING_S = 2.0
 
 
 class StationSettings(Settings):
     """Where the ground station meets the swarm, and where it shows its page."""
 
-    mesh: str = Field(
-        default="udpbcast://239.255.77.77:17700", description="udpbcast:// or udpout:// link of the swarm"
-    )
+    mesh: str = Field(default="udpbcast://239.255.77.77:17700", description=f"link of the swarm: {FORMS}")
     host: str = Field(default="127.0.0.1", description="address the page is served at")
     port: int = Field(default=8770, ge=0, le=65535, description="port of the page; 0 takes any free one")
     boot_file: str = Field(default="~/.imagine/ground.boot", description="remembers the boot number between starts")
@@ -44,17 +48,18 @@ class StationSettings(Settings):
 
 def run_station(
     settings: StationSettings,
-    key: bytes,
+    keys: KeyRing,
     on_start: Callable[[str], None],
     on_snapshot: Callable[[FleetSnapshot], None],
     stop: threading.Event,
 ) -> FleetSnapshot:
     """Run the ground station until `stop` is set; return its last snapshot.
 
-    `key` is the swarm's (`mesh_comm.keys.find_key`). `on_start` gets the page's address, `on_snapshot` five snapshots
-    a second, both from this thread. Raises InputError on a link or port that cannot be opened.
+    `keys` are the swarm's (`mesh_comm.keys.find_keys`). `on_start` gets the page's address, `on_snapshot` five
+    snapshots a second, both from this thread. Raises InputError on a link or port that cannot be opened, WorkError
+    once another ground station is known to be on the air: drones would heed only one of the two.
     """
-    sealer = Sealer(key, GROUND, next_boot_number(Path(settings.boot_file), time.time()))
+    sealer = start_sealer(keys, GROUND, Path(settings.boot_file), time.time())
     fleet = Fleet(settings.radio, sealer, range_cap_m=settings.map.range_cap_m)
     link = open_link(settings.mesh)
     try:
@@ -67,18 +72,23 @@ def run_station(
 
 def _loop(
     fleet: Fleet,
-    link: UdpModemLink | UdpBroadcastLink,
+    link: UdpModemLink | UdpNetworkLink,
     server: GroundServer,
     on_snapshot: Callable[[FleetSnapshot], None],
     stop: threading.Event,
 ) -> FleetSnapshot:
     next_snapshot = time.monotonic()
     snapshot = fleet.snapshot(next_snapshot)
+    refused_at = math.inf
     while not stop.is_set():
         select.select([link], [], [], _LOOP_S)
         now = time.monotonic()
         for datagram in link.receive():
             fleet.receive(datagram, now)
+        if fleet.node.has_namesake:  # the other one must hear of it before this one ends
+            refused_at = min(refused_at, now + _CLAIMING_S)
+        if now >= refused_at:
+            raise WorkError("another ground station is on the air, and drones heed only the one started last: end both")
         obey(fleet, server, now)
         for datagram in fleet.poll(now):
             link.send(datagram)
@@ -91,7 +101,13 @@ def _loop(
 
 
 def obey(fleet: Fleet, server: GroundServer, now: float) -> None:
-    """Pass on what pilots have asked for at the page; a request that makes no sense is logged and dropped."""
+    """Pass on what pilots have asked for at the page; a request that makes no sense is logged and dropped.
+
+    Questions about cells are answered.
+    """
+    for question in server.take_questions():
+        if question.answer.set_running_or_notify_cancel():  # else nobody waits any more
+            question.answer.set_result(cell_state(fleet.provenance(question.x, question.y), now))
     for request in server.take_requests():
         try:
             fleet.command(request.command, request.target, now)

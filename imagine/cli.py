@@ -413,6 +413,18 @@ def bench_train(
     bench_train_and_show(config, worlds, drones, rounds, quick, tuple(overrides or ()), json_file)
 
 
+@bench_app.command("seal")
+def bench_seal(
+    datagrams: Annotated[int, typer.Option(min=100, max=1_000_000, help="of each kind")] = 20_000,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure how many datagrams a core seals, opens and refuses a second."""
+    check_outputs(json_file)
+    from imagine.bench_seal_command import bench_seal_and_show
+
+    bench_seal_and_show(datagrams, json_file)
+
+
 @bench_app.command("twin")
 def bench_twin(
     level: Annotated[str, typer.Option(help="a level, 0 to 6, or a YAML file")] = "6",
@@ -457,12 +469,22 @@ def doctor(json_file: JsonFile = None) -> None:
 
 
 @app.command()
-def keygen(out: Annotated[Path, typer.Argument(help="where the key goes; the file must not exist")]) -> None:
-    """Make a key for a swarm's radio."""
-    from imagine.mesh_comm.keys import write_new_key
+def keygen(
+    out: Annotated[Path, typer.Argument(help="the drones' key file; it must not exist, or with --rotate must")],
+    ground: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="the ground station's file: it alone can then give orders")
+    ] = None,
+    rotate: Annotated[bool, typer.Option("--rotate", help="add a new key to the file, and let the others end")] = False,
+    after: Annotated[float, typer.Option(min=0.0, max=8760.0, help="hours until the new key sends")] = 24.0,
+    overlap: Annotated[float, typer.Option(min=0.0, max=8760.0, help="hours the others are heard after that")] = 24.0,
+) -> None:
+    """Make a key for a swarm's radio, or change it."""
+    from imagine.keygen_command import make_keys, renew_keys
 
-    write_new_key(out)
-    print(f"{out}: a new key, readable by you alone; copy it to every drone and the ground station")
+    if rotate:
+        renew_keys(out, ground, after, overlap)
+    else:
+        make_keys(out, ground)
 
 
 def _needs(package: str, extra: str) -> None:

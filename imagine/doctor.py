@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+import select
 import shutil
 import socket
 import subprocess
@@ -115,6 +116,37 @@ def _udp(name: str) -> Finding:
     return Finding(name, "ok", "datagrams arrive")
 
 
+def _multicast(name: str) -> Finding:
+    from imagine.mesh_comm.links import open_link
+    from imagine.mesh_comm.udp_sockets import interfaces
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        port = probe.getsockname()[1]
+    try:
+        link = open_link(f"udpbcast://239.255.77.77:{port}?interface=lo")
+    except InputError as error:
+        return Finding(name, "missing", f"{error}; udppeers:// does without")
+    try:
+        link.send(b"doctor")
+        heard = bool(select.select([link], [], [], _LOOPBACK_S)[0])
+    finally:
+        link.close()
+    there = ", ".join(interfaces())
+    if not heard:
+        return Finding(name, "missing", f"not heard on lo; udppeers:// does without; interfaces: {there}")
+    return Finding(name, "ok", f"heard on lo; interfaces: {there}")
+
+
+def _mesh_key(name: str) -> Finding:
+    from imagine.mesh_comm.keys import KEY_VARIABLE, find_keys
+
+    if not os.environ.get(KEY_VARIABLE):
+        return Finding(name, "missing", f"{KEY_VARIABLE} is not set; key_file in the settings does as well")
+    ring = find_keys(None, os.environ)
+    return Finding(name, "ok", f"{KEY_VARIABLE} holds " + ", ".join(f"key {key.id:02x}" for key in ring.keys))
+
+
 def _px4_port(name: str) -> Finding:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -148,6 +180,8 @@ _CHECKS: dict[str, Callable[[str], Finding]] = {
     "kernel cache": _kernel_cache,
     "shipped policy": _policy,
     "UDP loopback": _udp,
+    "mesh multicast": _multicast,
+    "mesh key": _mesh_key,
     "UDP port 14541": _px4_port,
     "Chromium": _browser,
     "GPU": _gpu,

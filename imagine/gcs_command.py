@@ -15,7 +15,7 @@ from rich.live import Live
 from imagine.core.config import load_settings
 from imagine.gcs.station import StationSettings, run_station
 from imagine.gcs.table import render
-from imagine.mesh_comm.keys import find_key
+from imagine.mesh_comm.keys import find_keys
 
 
 def watch_fleet(
@@ -25,11 +25,11 @@ def watch_fleet(
     flags = [f"mesh={json.dumps(mesh)}"] if mesh is not None else []
     flags += [f"port={port}"] if port is not None else []
     settings = load_settings(StationSettings, config, [*flags, *overrides])
-    key = find_key(key_file, os.environ)
+    keys = find_keys(key_file, os.environ)
     with Live(console=Console(), auto_refresh=False) as live, contextlib.suppress(KeyboardInterrupt):
         run_station(
             settings,
-            key,
+            keys,
             lambda url: live.console.print(f"ground station: {url}"),
             lambda snapshot: live.update(render(snapshot, live.console.width), refresh=True),
             threading.Event(),

@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
 from imagine.core.evidence import EvidenceMap
-from imagine.core.frames import Pose
+from imagine.core.frames import IDENTITY, Pose, compose
 from imagine.core.raster import CELL
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.codec import unpack_tile
+from imagine.mesh_comm.known_cells import KnownCells
 from imagine.mesh_comm.messages import Tiles, tile_key
-from imagine.mesh_comm.provenance import KnownCells
+from imagine.mesh_comm.provenance import CellProvenance, Provenance
 from imagine.mesh_comm.scan_exchange import draw_peer_scan
 from imagine.mesh_comm.settings import MeshSettings
 from imagine.mesh_comm.tile_exchange import TileExchange
@@ -28,20 +29,31 @@ class MapInbox:
         self._exchange = exchange
         self._settings = settings
         self._known = KnownCells(evidence)
+        self._provenance = Provenance(evidence)
 
-    def count_own(self, pose: Pose, range_cap_m: float) -> None:
-        """Count the cells that own scans have made known within a scan's reach of `pose`."""
-        self.own_cells += self._known.claim_around(pose.x, pose.y, range_cap_m + 2 * CELL)
+    def note_own(self, pose: Pose, range_cap_m: float, stamp: float, now: float) -> None:
+        """Note that an own scan of this stamp, taken at `pose`, was mapped, and count what own scans made known."""
+        self._provenance.note_own(stamp, now)
+        self._count_own(pose, range_cap_m)
 
-    def take_scan(self, scan: messages.Scan, teammates: NDArray[np.float64]) -> None:
-        """Draw a peer's scan, leaving out what lands on `teammates` (`[n, 2]` metres). Raises InputError."""
+    def take_scan(self, scan: messages.Scan, teammates: NDArray[np.float64], now: float) -> None:
+        """Draw a peer's scan, leaving out what lands on `teammates` (`[n, 2]` metres, the peer's frame).
+
+        Raises InputError.
+        """
         self._check_source(scan.sender)
-        self.count_own(scan.pose, scan.range_cap_m)
+        frame = self._evidence.placement(scan.sender)
+        where = None if frame is None else scan.pose if frame == IDENTITY else compose(frame, scan.pose)
+        if where is not None:
+            self._count_own(where, scan.range_cap_m)
         draw_peer_scan(self._evidence, scan, teammates, self._settings.mask_radius_m)
-        self.scan_cells += self._known.claim_around(scan.pose.x, scan.pose.y, scan.range_cap_m + 2 * CELL)
+        reach_m = scan.range_cap_m + 2 * CELL
+        self._provenance.note_scan(scan.sender, scan.pose.x, scan.pose.y, reach_m, scan.stamp, now)
+        if where is not None:
+            self.scan_cells += self._known.claim_around(where.x, where.y, reach_m)
 
-    def take_tiles(self, message: Tiles, is_source_near: bool) -> None:
-        """Merge tiles of another source. Raises InputError on a bad one; those before it are taken.
+    def take_tiles(self, message: Tiles, is_source_near: bool, via: int, now: float) -> None:
+        """Merge tiles of another source, heard from node `via`. Raises InputError on a bad one; those before stay.
 
         `is_source_near`: these are copies passed on by a third node while the source itself is in reach. Then tiles
         that hold the source's scans are left alone: they show more than the copy, and the source will send its own.
@@ -51,9 +63,22 @@ class MapInbox:
             key, cells = tile_key(tile), unpack_tile(tile.packed)
             if is_source_near and self._evidence.is_provisional(message.source, key):
                 continue
-            self.own_cells += self._known.claim_tile(key)
+            self.own_cells += self._known.claim_tile(message.source, key)
             if self._exchange.merge(message.source, tile, cells):
-                self.map_cells += self._known.claim_tile(key)
+                self._provenance.note_tile(message.source, key, tile.version, via, now)
+                self.map_cells += self._known.claim_tile(message.source, key)
+
+    def note_placed(self) -> None:
+        """Count what became known because a peer's map found its place, as cells that its tiles made known."""
+        self.map_cells += self._known.claim_all()
+
+    def provenance(self, x: float, y: float) -> CellProvenance:
+        """Return where the belief in the cell at (x, y), metres of the own frame, comes from."""
+        return self._provenance.at(x, y)
+
+    def _count_own(self, pose: Pose, range_cap_m: float) -> None:
+        """Count the cells that own scans have made known within a scan's reach of `pose`, own frame."""
+        self.own_cells += self._known.claim_around(pose.x, pose.y, range_cap_m + 2 * CELL)
 
     def outgrow(self, version: int) -> None:
         """After a restart, lift own tile versions above `version`, the greatest that a peer still holds."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
 from imagine.core.evidence import EvidenceMap
-from imagine.core.frames import Pose
+from imagine.core.frames import IDENTITY, Pose, inverse, transform_points
 from imagine.core.lidar import LidarSpec, Scan, mask_near
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.budget import TokenBucket
@@ -22,14 +22,15 @@ from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Command, Digest, Me
 from imagine.mesh_comm.orders import Orders
 from imagine.mesh_comm.peer_book import PeerBook
 from imagine.mesh_comm.peers import Peer, PeerRecord
+from imagine.mesh_comm.placement import Place, Placements
+from imagine.mesh_comm.provenance import CellProvenance
 from imagine.mesh_comm.scan_exchange import scan_message
-from imagine.mesh_comm.seal import OVERHEAD, Opened, Rejected, Sealer
+from imagine.mesh_comm.seal import Opened, Rejected, Sealer
 from imagine.mesh_comm.settings import MeshSettings
 from imagine.mesh_comm.tile_exchange import TileExchange
 
 __all__ = ["MeshNode", "MeshSettings", "Peer"]
 
-_MAX_PAYLOAD = MAX_DATAGRAM - OVERHEAD
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4  # of a longer digest, this many go out per period, in turn
 _EPSILON_S = 1e-6  # periods are whole ticks: rounding of their sum must not cost a tick
@@ -63,8 +64,13 @@ class MeshNode:
         self._lidar = lidar
         self._range_cap_m = range_cap_m
         self._sealer = sealer
+        self._max_payload = MAX_DATAGRAM - sealer.overhead
         self._bucket = TokenBucket(settings.rate_bytes_per_s, settings.burst_bytes)
-        self._peers = PeerBook(settings)
+        evidence.shares_frame = settings.frame == "shared"
+        self._placements = (
+            None if evidence.shares_frame else Placements(evidence, settings.alignment, settings.launches)
+        )
+        self._peers = PeerBook(settings, evidence.placement)
         self._exchange = TileExchange(evidence, settings)
         self._maps = MapInbox(evidence, self._exchange, settings)
         self._orders = Orders(self.id, sealer.boot, settings.command_repeat_s)
@@ -83,12 +89,9 @@ class MeshNode:
     def receive(self, datagram: bytes, now: float) -> None:
         """Take in whatever the radio heard. Never raises on its content: what is wrong is counted in `stats`."""
         try:
-            opened = self._sealer.open(datagram)
+            opened = self._sealer.open(datagram, now)
         except Rejected:
             return  # counted by the sealer
-        if opened.sender == self.id:
-            self._dropped["own-id"] += 1  # another node runs under this id, or an earlier life of this one
-            return
         try:
             message = messages.decode(opened.payload)
         except messages.Unreadable as error:
@@ -123,7 +126,7 @@ class MeshNode:
             case messages.Scan():
                 peer.note_pose(message.pose, message.stamp, now)
                 if takes_maps:
-                    self._maps.take_scan(message, self._not_walls(sender, now))
+                    self._maps.take_scan(message, self._not_walls(sender, now), now)
             case Tiles():
                 if takes_maps:
                     self._take_tiles(message, peer, now)
@@ -137,7 +140,7 @@ class MeshNode:
         elif is_relayed and self.settings.protocol == "one-hop" and self.id != GROUND:
             return
         else:
-            self._maps.take_tiles(message, is_relayed and self._peers.is_live(source, now))
+            self._maps.take_tiles(message, is_relayed and self._peers.is_live(source, now), peer.id, now)
         for tile in message.tiles:  # only now that all of it has proved sound: what is noted is kept
             peer.note_held(source, tile_key(tile), tile.version)
             if source != self.id:
@@ -157,13 +160,13 @@ class MeshNode:
         if self.id == GROUND:
             raise InputError("the ground station has no scans to offer")
         self._pose = pose
-        self._maps.count_own(pose, self._range_cap_m)
+        self._maps.note_own(pose, self._range_cap_m, scan.stamp, now)
         clock = self._evidence.layers[self.id].clock
         if now < self._next_scan - _EPSILON_S or clock == self._scan_clock or not self._peers.map_listeners(now):
             return
         masked = mask_near(scan.ranges, self._lidar, pose, self.teammates(now), self.settings.mask_radius_m)
         offered = Scan(scan.stamp, masked)
-        self._scan = scan_message(self.id, clock, pose, offered, self._lidar, self._range_cap_m, _MAX_PAYLOAD)
+        self._scan = scan_message(self.id, clock, pose, offered, self._lidar, self._range_cap_m, self._max_payload)
 
     def set_status(self, status: Status) -> None:
         """Set what the next status message tells; cells, bytes, links, rejections and command are filled in."""
@@ -190,13 +193,28 @@ class MeshNode:
         return self._peers.view(now)
 
     def teammates(self, now: float, leave_out: int | None = None) -> NDArray[np.float64]:
-        """Return where live peers are by now, `[n, 2]` metres, map frame: returns there are not walls."""
+        """Return where live peers are by now, `[n, 2]` metres, own frame: returns there are not walls."""
         return self._peers.positions(now, leave_out)
 
     def _not_walls(self, scanner: int, now: float) -> NDArray[np.float64]:
-        """Return where a scan of peer `scanner` sees drones: its teammates and this one."""
+        """Return where a scan of peer `scanner` sees drones, in its frame: its teammates and this one."""
+        frame = self._evidence.placement(scanner)
+        if frame is None:
+            return np.zeros((0, 2))
         others = self.teammates(now, leave_out=scanner)
-        return others if self._pose is None else np.vstack((others, [self._pose[:2]]))
+        if self._pose is not None:
+            others = np.vstack((others, [self._pose[:2]]))
+        return others if frame == IDENTITY else transform_points(inverse(frame), others)
+
+    def place(self, peer: int) -> Place:
+        """Return what is known of where a peer's frame lies in the own."""
+        if self._placements is None:
+            return Place("given", IDENTITY, 0, None)
+        return self._placements.place(peer)
+
+    def provenance(self, x: float, y: float) -> CellProvenance:
+        """Return who saw the cell at (x, y), metres of the own frame, when, and by which way that came here."""
+        return self._maps.provenance(x, y)
 
     @property
     def own_cells(self) -> int:
@@ -214,6 +232,11 @@ class MeshNode:
         return self._maps.map_cells
 
     @property
+    def has_namesake(self) -> bool:
+        """Whether another node is known to have used this node's id since this one started; neither may go on."""
+        return self._sealer.has_namesake
+
+    @property
     def stats(self) -> dict[str, int]:
         """How many datagrams were dropped, by reason."""
         return dict(sorted((self._sealer.rejected + self._dropped).items()))
@@ -223,8 +246,10 @@ class MeshNode:
     def poll(self, now: float) -> list[bytes]:
         """Return the datagrams to send at `now`, most urgent first, as many as the byte budget allows."""
         out: list[bytes] = []
+        if self._placements is not None and self._placements.advance(now):
+            self._maps.note_placed()
         self._prepare(now)
-        steps = [self._send_commands, self._send_status, self._send_digests]
+        steps = [self._send_claim, self._send_commands, self._send_status, self._send_digests]
         steps += [self._send_tiles, self._send_scan] if self._tiles_first else [self._send_scan, self._send_tiles]
         for step in steps:
             if not step(out, now):
@@ -244,13 +269,23 @@ class MeshNode:
         if has_readers and now >= self._next_digest - _EPSILON_S:
             self._next_digest = now + self.settings.digest_period_s
             held = {source: self._evidence.versions(source) for source in self._evidence.layers if source != self.id}
-            parts = digests(now, held, _MAX_PAYLOAD)
+            parts = digests(now, held, self._max_payload)
             turn = self._digest_turn % len(parts)
             self._digests = deque((parts[turn:] + parts[:turn])[:_DIGEST_DATAGRAMS])
             self._digest_turn = turn + _DIGEST_DATAGRAMS
         if self.id != GROUND and now >= self._next_plan - _EPSILON_S:
             self._next_plan = now + _PLAN_PERIOD_S
             self._exchange.plan([peer for peer in self._peers.map_listeners(now) if np.isfinite(peer.digest_at)], now)
+
+    def _send_claim(self, out: list[bytes], now: float) -> bool:
+        claim = self._sealer.claim(now)
+        if claim is None:
+            return True
+        if not self._bucket.take(len(claim), now):  # lost: the next datagram of the namesake asks for another
+            return False
+        out.append(claim)
+        self.bytes_sent["status"] += len(claim)
+        return True
 
     def _send_commands(self, out: list[bytes], now: float) -> bool:
         relays = self._orders.relays
@@ -301,7 +336,7 @@ class MeshNode:
         return True
 
     def _send_tiles(self, out: list[bytes], now: float) -> bool:
-        while (message := self._exchange.next_message(_MAX_PAYLOAD)) is not None:
+        while (message := self._exchange.next_message(self._max_payload)) is not None:
             if not self._send(message, "tile", out, now):
                 return False
             self._exchange.note_sent(message, now)
@@ -310,9 +345,9 @@ class MeshNode:
     def _send(self, message: Message, kind: str, out: list[bytes], now: float) -> bool:
         """Seal a message and put it out if the budget allows; tell whether it did."""
         payload = messages.encode(message)
-        size = len(payload) + OVERHEAD
+        size = len(payload) + self._sealer.overhead
         if not self._bucket.take(size, now):
             return False
-        out.append(self._sealer.seal(payload))
+        out.append(self._sealer.seal(payload, now))
         self.bytes_sent[kind] += size
         return True

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine.core.frames import IDENTITY, Pose, compose, rotate, transform_points
 from imagine.mesh_comm.messages import GROUND
 from imagine.mesh_comm.peers import Peer, PeerRecord
 from imagine.mesh_comm.seal import Opened
@@ -16,11 +18,16 @@ _log = logging.getLogger(__name__)
 
 
 class PeerBook:
-    """The records of all peers by id; a peer is live when it was heard within the settings' timeout."""
+    """The records of all peers by id; a peer is live when it was heard within the settings' timeout.
 
-    def __init__(self, settings: MeshSettings) -> None:
+    Peers say where they are in their own frames. `frame_of` tells where a peer's frame lies in the own (None: nobody
+    knows), and what is shown here is in the own.
+    """
+
+    def __init__(self, settings: MeshSettings, frame_of: Callable[[int], Pose | None]) -> None:
         """Start with nobody heard."""
         self._settings = settings
+        self._frame_of = frame_of
         self._records: dict[int, PeerRecord] = {}
 
     def hear(self, opened: Opened, now: float) -> PeerRecord:
@@ -54,7 +61,7 @@ class PeerBook:
     def view(self, now: float) -> dict[int, Peer]:
         """Return everyone ever heard as the outside sees them, by id."""
         return {
-            id_: Peer(id_, max(0.0, now - r.heard_at), self.is_live(id_, now), r.pose, r.velocity, r.status)
+            id_: Peer(id_, max(0.0, now - r.heard_at), self.is_live(id_, now), *self._placed(r), r.status)
             for id_, r in sorted(self._records.items())
         }
 
@@ -64,6 +71,20 @@ class PeerBook:
         return {record.id: round(max(0.0, now - record.heard_at), 3) for record in latest}
 
     def positions(self, now: float, leave_out: int | None = None) -> NDArray[np.float64]:
-        """Return where the live peers should be by now, `[n, 2]` metres, map frame."""
-        places = [record.position(now) for record in self.live(now) if record.id != leave_out]
-        return np.array([place for place in places if place is not None], np.float64).reshape(-1, 2)
+        """Return where the live peers should be by now, `[n, 2]` metres, own frame; without those of unknown frames."""
+        places = []
+        for record in self.live(now):
+            place, frame = record.position(now), self._frame_of(record.id)
+            if record.id == leave_out or place is None or frame is None:
+                continue
+            places.append(place if frame == IDENTITY else transform_points(frame, np.array([place]))[0])
+        return np.array(places, np.float64).reshape(-1, 2)
+
+    def _placed(self, record: PeerRecord) -> tuple[Pose | None, tuple[float, float]]:
+        """Return a peer's pose and velocity in the own frame; None, and standing, where nobody knows its frame."""
+        frame = self._frame_of(record.id)
+        if frame is None:
+            return None, (0.0, 0.0)
+        if frame == IDENTITY:
+            return record.pose, record.velocity
+        return None if record.pose is None else compose(frame, record.pose), rotate(frame.yaw, *record.velocity)

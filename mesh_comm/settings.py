@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from imagine.core.config import Settings
+from imagine.core.frames import Pose
 from imagine.core.lidar import TEAMMATE_RADIUS_M
+from imagine.mesh_comm.alignment import AlignmentSettings
 
 Protocol = Literal["off", "one-hop", "multi-hop"]
 """`off`: status only (the ground is still served); `one-hop`: own scans and tiles; `multi-hop`: relays too."""
+
+Frame = Literal["shared", "layout", "unknown"]
+"""`shared`: all drones map in one frame; `layout`: each in its own, begun where `layout` says; `unknown`: each in its
+own, found out from the maps."""
 
 
 class MeshSettings(Settings):
@@ -29,3 +35,19 @@ class MeshSettings(Settings):
     )
     command_repeat_s: float = Field(default=2.0, ge=0.0, description="the ground repeats a command for so long")
     max_sources: int = Field(default=32, ge=1, le=254, description="most drones whose maps are kept: bounds memory")
+    frame: Frame = "shared"
+    layout: dict[int, tuple[float, float, float]] = Field(
+        default={}, description="where each drone's frame begins: x, y, metres, and yaw, radians, in a common frame"
+    )
+    alignment: AlignmentSettings = AlignmentSettings()
+
+    @property
+    def launches(self) -> dict[int, Pose]:
+        """The layout as poses, by drone; empty unless `frame` is `layout`."""
+        return {drone: Pose(*pose) for drone, pose in self.layout.items()} if self.frame == "layout" else {}
+
+    @model_validator(mode="after")
+    def _has_layout(self) -> Self:
+        if (self.frame == "layout") != bool(self.layout):
+            raise ValueError("frame 'layout' needs a layout, and a layout needs frame 'layout'")
+        return self

@@ -72,7 +72,7 @@ def vectors() -> dict[str, Any]:
             {
                 "kind": type(message).__name__,
                 "sender": sender,
-                "datagram": sealers[sender].seal(payload).hex(),
+                "datagram": sealers[sender].seal(payload, 0.0).hex(),
                 "payload": payload.hex(),
                 "content": content(message),
             }

@@ -16,7 +16,7 @@ from imagine.core.peer_poses import PeerPoses
 from imagine.core.planner import plan_velocity
 from imagine.core.shield import shield_velocity
 from imagine.core.visits import VisitMap
-from imagine.mesh_comm.keys import default_boot_file, find_key, next_boot_number
+from imagine.mesh_comm.keys import default_boot_file, find_keys, start_sealer
 from imagine.mesh_comm.node import MeshNode
 from imagine.mesh_comm.seal import KEY_BYTES, Sealer
 from imagine.onboard.perception import Perception, PerceptionSettings
@@ -52,13 +52,16 @@ def load_policy(settings: DroneSettings) -> OnnxPolicy | None:
 def mesh_sealer(settings: DroneSettings, environ: Mapping[str, str], unix_time_s: float) -> Sealer | None:
     """Return the seal of this drone's mesh messages, None without mesh.
 
-    Raises InputError without a key, and where the boot number cannot be remembered.
+    Raises InputError without a key, for a key file that is named and cannot be used even where there is no mesh, and
+    where the boot number cannot be remembered.
     """
+    if settings.mesh is None and settings.key_file is None:
+        return None
+    keys = find_keys(settings.key_file, environ)
     if settings.mesh is None:
         return None
-    key = find_key(settings.key_file, environ)
     boot_file = settings.boot_file or default_boot_file(settings.drone_id)
-    return Sealer(key, settings.drone_id, next_boot_number(boot_file, unix_time_s))
+    return start_sealer(keys, settings.drone_id, boot_file, unix_time_s)
 
 
 def warm_up(settings: DroneSettings, policy: Policy | None) -> None:

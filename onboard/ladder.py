@@ -42,7 +42,7 @@ class Situation:
 
     `policy` and `frontier` are the velocities the two propose; None: the policy failed (`policy_failure` says how) or
     is absent, no frontier is in reach. `lost_s`: since a scan was last tracked. `silent_s`: age of the telemetry.
-    `height_age_s`: since a rangefinder that had been heard fell silent.
+    `height_age_s`: since a rangefinder that had been heard fell silent. `must_land`: why the flight may not go on.
     """
 
     now: float
@@ -62,6 +62,7 @@ class Situation:
     exploring: bool = True
     has_scan: bool = True
     height_age_s: float = 0.0
+    must_land: str = ""
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,8 @@ class Ladder:
 
     def _must_land(self, s: Situation) -> Decision | None:
         c = self.settings
+        if s.must_land:
+            return Decision(Decider.LAND, STILL, s.must_land, failsafe=True)
         if s.order is Order.LAND:
             return Decision(Decider.LAND, STILL, "the pilot ordered landing")
         if s.ending:

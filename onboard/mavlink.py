@@ -20,7 +20,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from imagine.core import ned
 from imagine.core.errors import InputError
-from imagine.mesh_comm.links import parse_udp_url
+from imagine.mesh_comm.link_url import parse_udp_url
 from imagine.onboard.records import OdometryOut, Setpoint, Telemetry, VehicleCommand
 from imagine.onboard.telemetry import TelemetryAssembler
 

@@ -19,7 +19,9 @@ from types import FrameType
 
 from imagine.core.errors import InputError, WorkError
 from imagine.core.lidar import Scan
-from imagine.mesh_comm.links import MeshLink, UdpBroadcastLink, UdpModemLink, open_link
+from imagine.mesh_comm.links import MeshLink, open_link
+from imagine.mesh_comm.udp_modem import UdpModemLink
+from imagine.mesh_comm.udp_network import UdpNetworkLink
 from imagine.onboard.autopilot import Autopilot
 from imagine.onboard.build import build_runner, load_policy, mesh_sealer, warm_up
 from imagine.onboard.lidar_source import LidarSource
@@ -37,6 +39,7 @@ _SCAN_WAIT_S = 0.1  # how long the loop sleeps at most: bounds the answer to a s
 _NO_SCAN_TICK_S = 0.25  # without scans the runner still ticks this often, to hold, land and tell
 _ENDING_S = 20.0  # from the request to end until the process goes, landed or not
 _ENDING_SILENT_S = 0.6  # and this long, if no scans come either: there is nothing left to fly by
+_CLAIMING_S = 2.0  # on the ground, so long is told on the air that another drone has this one's id
 _RELEASED_S = 60.0
 
 
@@ -94,7 +97,9 @@ def run_drone(settings: DroneSettings) -> int:
             dropped = loop.record.dropped
             dropped.update(autopilot.dropped)
             dropped.update(lidar.dropped)
-            dropped["mesh_lost"] += link.lost if isinstance(link, (UdpModemLink, UdpBroadcastLink)) else 0
+            dropped.update(mesh_lost=0, mesh_oversize=0)
+            if isinstance(link, UdpModemLink | UdpNetworkLink):
+                dropped.update(mesh_lost=link.lost, mesh_oversize=link.oversize)
             try:
                 loop.leave_behind(settings.report, settings.map_out)
             except (InputError, WorkError) as error:  # what befell the flight itself is told first
@@ -217,12 +222,17 @@ class Loop:
             return True
         if self._final_at is None or self.settings.stay:
             return False
+        if self.runner.mesh is not None and self.runner.mesh.has_namesake and now - self._final_at < _CLAIMING_S:
+            return False  # the other one must hear of it
         down = phase is not Phase.RELEASED or self.runner.is_disarmed
         return down or now - self._final_at > _RELEASED_S
 
 
 def _raise_failure(runner: Runner, gave_up: str | None) -> None:
     flight = runner.flight
+    if runner.mesh is not None and runner.mesh.has_namesake:
+        number = runner.settings.drone_id
+        raise WorkError(f"drone {number} did not go on: another node is on the air as {number}; set another drone_id")
     if flight.phase is Phase.FAILED:
         raise WorkError(f"drone {runner.settings.drone_id} did not fly: {flight.reason}")
     if flight.phase is Phase.RELEASED:

@@ -87,6 +87,7 @@ class Runner:
         self._tracked_at: float | None = None
         self._reset_counter = 0
         self._order = Order.RESUME
+        self._must_not_fly = ""
         self._decider = Decider.HOLD
         self._was_exploring = False
         self._events: list[Event] = []
@@ -127,6 +128,10 @@ class Runner:
             return
         for datagram in inputs.datagrams:
             self.mesh.receive(datagram, inputs.now)
+        if self.mesh.has_namesake and not self._must_not_fly:
+            # both write one map layer and answer to one name: neither's word is worth anything to the team
+            self._must_not_fly = f"another node is on the air as drone {self.mesh.id}"
+            self._tell(inputs.now, "failsafe", f"land: {self._must_not_fly}")
         for command in self.mesh.commands():
             if self._order is not Order.LAND:  # a landing stands
                 self._order = Order(command.action)
@@ -207,6 +212,7 @@ class Runner:
                 battery=telemetry.battery if telemetry is not None else None,
                 airborne_s=self.flight.airborne_s(now),
                 order=self._order,
+                must_land=self._must_not_fly,
                 ending=inputs.ending,
                 exploring=self._was_exploring,
                 has_scan=not unseen,
@@ -224,7 +230,9 @@ class Runner:
         land_reason = decision.reason if decision.decider is Decider.LAND else None
         if self.flight.phase not in AIRBORNE:  # the ladder is not asked on the ground
             charge = inputs.telemetry.battery if inputs.telemetry is not None else None
-            if inputs.ending:
+            if self._must_not_fly:
+                land_reason = self._must_not_fly
+            elif inputs.ending:
                 land_reason = "the runner was asked to end"
             elif self._order is Order.LAND:
                 land_reason = "the pilot ordered landing"

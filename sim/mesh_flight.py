@@ -115,7 +115,7 @@ class MeshFlight:
         for node in self.nodes:
             for datagram in node.poll(now):
                 self.radio.send(node.id, datagram, now)
-                message = messages.decode(self._reader.open(datagram).payload)
+                message = messages.decode(self._reader.open(datagram, now).payload)
                 self.said.append(Said(tick, node.id, message, len(datagram)))
         self.twin.step(setpoints)
         known = np.array([np.count_nonzero(evidence.belief()) for evidence in self.maps])

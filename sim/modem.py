@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 
-from imagine.mesh_comm.links import HELLO
+from imagine.mesh_comm.udp_modem import HELLO
 from imagine.sim.sockets import Address, bind_udp, drain
 
 logger = logging.getLogger(__name__)

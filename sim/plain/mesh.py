@@ -74,7 +74,7 @@ class PlainMesh:
 
     def tell(self, sender: int, receiver: int, message: Message, at: float) -> None:
         """Let drone `receiver` have heard a message of drone `sender` (both counted from 0) at a time."""
-        self.nodes[receiver].receive(self._sealers[sender].seal(encode(message)), at)
+        self.nodes[receiver].receive(self._sealers[sender].seal(encode(message), at), at)
 
     def bytes_sent(self) -> NDArray[np.int64]:
         """Return the sealed bytes each has sent by kind (scan, tile, digest, status), `[drones, 4]`."""

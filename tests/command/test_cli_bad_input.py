@@ -244,6 +244,9 @@ def test_a_truncated_recording_is_refused_and_a_sparse_one_fails(tmp_path: Path)
 def test_a_damaged_key_is_refused(tmp_path: Path) -> None:
     key = tmp_path / "swarm.key"
     key.write_text("not a key\n")
+    key.chmod(0o644)
+    refused(["gcs", "--key", key, "--port", "0"], r"swarm\.key: others .* can read", "chmod 600")
+    key.chmod(0o600)
     refused(["gcs", "--key", key, "--port", "0"], r"swarm\.key: the mesh key is not hexadecimal")
     refused(["keygen", key], r"swarm\.key: exists already")
     refused([*on_a_drone(), "--mesh", "udpout://127.0.0.1:9"], "IMAGINE_MESH_KEY", "digits", IMAGINE_MESH_KEY="abcd")

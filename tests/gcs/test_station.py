@@ -12,12 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from imagine.core.errors import InputError
+from imagine.core.errors import InputError, WorkError
 from imagine.core.evidence import EvidenceMap
 from imagine.core.frames import Pose
 from imagine.core.lidar import LD19
 from imagine.gcs.snapshot import FleetSnapshot
 from imagine.gcs.station import StationSettings, run_station
+from imagine.mesh_comm.keyring import KeyRing
 from imagine.mesh_comm.messages import Status
 from imagine.mesh_comm.node import MeshNode, MeshSettings
 from imagine.mesh_comm.seal import Sealer
@@ -40,7 +41,7 @@ def test_a_drone_on_udp_is_shown_and_obeys_the_page(tmp_path: Path) -> None:
     last: list[FleetSnapshot] = []
     stop = threading.Event()
     station = threading.Thread(
-        target=lambda: last.append(run_station(settings, KEY, urls.put, shots.put, stop)), daemon=True
+        target=lambda: last.append(run_station(settings, KeyRing.of(KEY), urls.put, shots.put, stop)), daemon=True
     )
     station.start()
     node = MeshNode(EvidenceMap(own=1), LD19, 4.0, MeshSettings(), Sealer(KEY, 1, 1))
@@ -78,4 +79,29 @@ def test_a_drone_on_udp_is_shown_and_obeys_the_page(tmp_path: Path) -> None:
 def test_a_mesh_link_that_makes_no_sense_is_an_input_error(tmp_path: Path) -> None:
     settings = StationSettings(mesh="carrier pigeon", port=0, boot_file=str(tmp_path / "boot"))
     with pytest.raises(InputError, match="carrier pigeon"):
-        run_station(settings, KEY, print, print, threading.Event())
+        run_station(settings, KeyRing.of(KEY), print, print, threading.Event())
+
+
+def test_a_second_ground_station_ends_with_the_first_one(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        port = probe.getsockname()[1]
+    refusals: list[str] = []
+
+    def run(number: int) -> None:
+        url = f"udpbcast://239.255.77.77:{port}?interface=lo"
+        settings = StationSettings(mesh=url, port=0, boot_file=str(tmp_path / f"boot-{number}"))
+        try:
+            run_station(settings, KeyRing.of(KEY), lambda url: None, lambda shot: None, stop)
+        except WorkError as error:
+            refusals.append(str(error))
+
+    stop = threading.Event()
+    stations = [threading.Thread(target=run, args=(number,), daemon=True) for number in range(2)]
+    for station in stations:
+        station.start()
+    for station in stations:
+        station.join(DEADLINE_S)
+    stop.set()
+    assert len(refusals) == 2
+    assert all("another ground station" in text for text in refusals)

@@ -64,7 +64,7 @@ def make_drone(id_: int, boot: int = 1, key: bytes = KEY, **settings: object) ->
 def contents(datagrams: list[bytes]) -> list[messages.Message]:
     """Return the messages of datagrams, as an eavesdropper with the key reads them."""
     eavesdropper = Sealer(KEY, 254, 1)
-    return [messages.decode(eavesdropper.open(datagram).payload) for datagram in datagrams]
+    return [messages.decode(eavesdropper.open(datagram, 0.0).payload) for datagram in datagrams]
 
 
 def carrying(datagrams: list[bytes], kind: type) -> list[bytes]:

@@ -370,7 +370,7 @@ def test_only_the_ground_gives_orders() -> None:
         drone.node.send_command("land", 0, 0.0)
     with pytest.raises(InputError, match="explode"):
         make_drone(0).node.send_command("explode", 0, 0.0)
-    forged = Sealer(KEY, 1, 1).seal(messages.encode(messages.Command("land", 0, 7)))
+    forged = Sealer(KEY, 1, 1).seal(messages.encode(messages.Command("land", 0, 7)), 0.0)
     victim.node.receive(forged, 0.0)
     assert victim.node.commands() == []
     assert victim.node.stats == {"content": 1}
@@ -429,7 +429,7 @@ def test_mutated_messages_never_raise_even_under_the_right_key(data: st.DataObje
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     payload = payload[: data.draw(st.integers(0, len(payload)))]
     drone = _LISTENER
-    drone.node.receive(_FORGER.seal(bytes(payload)), 0.0)
+    drone.node.receive(_FORGER.seal(bytes(payload), 0.0), 0.0)
     drone.node.poll(0.0)
     assert own_tiles(drone.evidence) == _OWN_TILES
     assert len(drone.evidence.layers) <= 4
@@ -439,7 +439,7 @@ def test_mutated_messages_never_raise_even_under_the_right_key(data: st.DataObje
 @settings(max_examples=100, deadline=None)
 @given(data=st.data())
 def test_a_datagram_altered_on_the_way_changes_nothing(data: st.DataObject) -> None:
-    datagram = bytearray(_FORGER.seal(data.draw(st.sampled_from(_PAYLOADS))))
+    datagram = bytearray(_FORGER.seal(data.draw(st.sampled_from(_PAYLOADS)), 0.0))
     at = data.draw(st.integers(0, len(datagram) - 1))
     datagram[at] ^= 1 << data.draw(st.integers(0, 7))
     drone = _LISTENER
@@ -481,11 +481,11 @@ def test_a_tile_far_outside_is_refused_and_memory_stays_bounded() -> None:
     shape = drone.evidence.shape
     cells = pack_tile(np.ones((32, 32), np.int8))
     for column, row in ((160, 0), (-160, 0), (0, 160), (160, -160)):
-        drone.node.receive(_FORGER.seal(messages.encode(Tiles(1, [Tile(column, row, 1, cells)]))), 0.0)
+        drone.node.receive(_FORGER.seal(messages.encode(Tiles(1, [Tile(column, row, 1, cells)])), 0.0), 0.0)
     assert drone.evidence.shape == shape
     assert drone.node.stats["content"] == 4
     for source in range(3, 250):
-        drone.node.receive(_FORGER.seal(messages.encode(Tiles(source, [Tile(0, 0, 1, cells)]))), 0.0)
+        drone.node.receive(_FORGER.seal(messages.encode(Tiles(source, [Tile(0, 0, 1, cells)])), 0.0), 0.0)
     assert len(drone.evidence.layers) == 4  # own and max_sources
 
 
@@ -503,10 +503,10 @@ def test_nothing_is_noted_of_tiles_that_are_refused(tiles: Tiles) -> None:
     drone = listener()
     cells = pack_tile(np.ones((32, 32), np.int8))
     for source in (3, 4) if tiles.source == 1 else (3, 4, 5):
-        drone.node.receive(_FORGER.seal(messages.encode(Tiles(source, [Tile(0, 0, 1, cells)]))), 0.0)
+        drone.node.receive(_FORGER.seal(messages.encode(Tiles(source, [Tile(0, 0, 1, cells)])), 0.0), 0.0)
     record, noted = drone.node._peers.live(0.0)[0], len(drone.node._exchange._sent)
     before = {source: dict(held) for source, held in record.holdings.items()}
-    drone.node.receive(_FORGER.seal(messages.encode(tiles)), 0.1)
+    drone.node.receive(_FORGER.seal(messages.encode(tiles), 0.1), 0.1)
     assert drone.node.stats["content"] == 1
     assert record.holdings == before
     assert len(drone.node._exchange._sent) == noted
@@ -518,10 +518,10 @@ def test_what_newer_nodes_say_is_counted_and_hurts_nothing() -> None:
     order = messages.encode(messages.Command("land", 2, 3))
     kind_6, version_3 = bytes((order[0],)) + b"\x92\x06\x01", b"\x03" + order[1:]
     for payload in (kind_6, version_3, version_3):
-        drone.node.receive(_FORGER.seal(payload), 0.0)
-    assert drone.node.stats == {"kind": 1, "version": 2}
+        drone.node.receive(_FORGER.seal(payload, 0.0), 0.0)
+    assert drone.node.stats == {"unknown-kind": 1, "wire-version": 2}
     status = msgspec.msgpack.decode(messages.encode(Status(1, 0.0, Pose(0.5, 0.0, 0.0)))[1:])
-    drone.node.receive(_FORGER.seal(order[:1] + msgspec.msgpack.encode([*status, "news"])), 0.0)
+    drone.node.receive(_FORGER.seal(order[:1] + msgspec.msgpack.encode([*status, "news"]), 0.0), 0.0)
     assert drone.node.newer == 1
     assert drone.node.peers(0.0)[1].is_live
     assert sum(drone.node.stats.values()) == 3
@@ -531,7 +531,7 @@ def test_what_newer_nodes_say_is_counted_and_hurts_nothing() -> None:
 def test_a_node_in_anothers_name_is_refused() -> None:
     drone = listener()
     status = messages.encode(Status(3, 0.0, Pose(0.0, 0.0, 0.0)))
-    drone.node.receive(_FORGER.seal(status), 0.0)
+    drone.node.receive(_FORGER.seal(status, 0.0), 0.0)
     assert drone.node.peers(0.0) == {}
     assert drone.node.stats == {"content": 1}
 

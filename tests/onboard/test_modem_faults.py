@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from imagine.mesh_comm.links import UdpModemLink
+from imagine.mesh_comm.udp_modem import UdpModemLink
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def test_a_datagram_that_the_system_refuses_is_counted(modem: socket.socket, lin
 
 
 def test_a_flood_ends_a_reading(modem: socket.socket, link: UdpModemLink, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("imagine.mesh_comm.links._MOST_READS", 5)
+    monkeypatch.setattr("imagine.mesh_comm.udp_modem._MOST_READS", 5)
     _, address = modem.recvfrom(100)
     for number in range(7):
         modem.sendto(bytes([number + 1]), address)

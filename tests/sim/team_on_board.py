@@ -132,7 +132,7 @@ class TeamOnBoard:
         for sender in self.drones:
             x, y, yaw = (float(number) for number in self.env.estimates[sender.at])
             status = messages.Status(sender.id, 0.0, Pose(x, y, yaw), ladder="climb")
-            datagram = self._sealers[sender.at[1]].seal(messages.encode(status))
+            datagram = self._sealers[sender.at[1]].seal(messages.encode(status), 0.0)
             for own in self.drones:
                 if self.env.air.state.reach[self.world, sender.at[1], own.at[1]]:
                     own.node.receive(datagram, 0.0)
@@ -191,7 +191,7 @@ class TeamOnBoard:
             self._said_until[own.at[1]] = record["sequence"]
             self.said[kind] += 1
             message = self._message(own, record, told, now)
-            datagram = self._sealers[own.at[1]].seal(messages.encode(message))
+            datagram = self._sealers[own.at[1]].seal(messages.encode(message), now)
             self._in_flight.append(InFlight(float(record["arrival"]), own.at[1], int(record["sequence"]), datagram))
 
     def _message(self, own: OnBoard, record: Any, told: list[list[int]], now: float) -> messages.Message:

@@ -140,7 +140,7 @@ def test_a_tile_is_always_what_its_source_had_at_that_version(
                 assert np.array_equal(tile(state.confirmed[0, holder, source], row, column), truth)
 
     fly(chain, 40, each=check, seed=seed)
-    assert chain.versions[1, 0].any() or loss > 0.3
+    assert chain.versions[1, 0].any() or loss > 0.2  # then four seconds may be too short for a whole tile
 
 
 @pytest.mark.parametrize("rate", [1_000.0, 2_500.0])

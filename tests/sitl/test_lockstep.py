@@ -19,8 +19,8 @@ from imagine.core.errors import InputError, WorkError
 from imagine.core.lidar import LidarSpec, Scan
 from imagine.core.lidar_wire import decode_scan
 from imagine.core.ned import swap_enu_ned, swap_flu_frd, swap_yaw
-from imagine.mesh_comm.links import HELLO
 from imagine.mesh_comm.markers import decode_marker, encode_marker
+from imagine.mesh_comm.udp_modem import HELLO
 from imagine.sim.drone_edge import Endpoint
 from imagine.sim.flight_control import STREAM_LOST, Mode
 from imagine.sim.level import load_level

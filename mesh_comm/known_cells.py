@@ -1,0 +1,77 @@
+"""Who first made a cell known: the drone itself, a peer's scan, or a peer's tile."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from imagine.core.evidence import EvidenceMap, TileKey
+from imagine.core.frames import IDENTITY, transform_points
+from imagine.core.raster import CELL, TILE
+
+
+class KnownCells:
+    """The cells of a map that have been known at least once, so that each is claimed only once.
+
+    A cell is known when the sum of its evidence over the placed sources is not zero.
+    """
+
+    def __init__(self, evidence: EvidenceMap) -> None:
+        """Start with nothing known."""
+        self._evidence = evidence
+        self._origin = evidence.origin_cells
+        self._known = np.zeros(evidence.shape, np.bool_)
+
+    def claim_around(self, x: float, y: float, reach_m: float) -> int:
+        """Return how many cells of a square around (x, y), metres, have become known since the last claim on them."""
+        column0, column1 = math.floor((x - reach_m) / CELL), math.floor((x + reach_m) / CELL) + 1
+        row0, row1 = math.floor((y - reach_m) / CELL), math.floor((y + reach_m) / CELL) + 1
+        return self._claim(column0, row0, column1, row1)
+
+    def claim_tile(self, source: int, key: TileKey) -> int:
+        """Return how many cells where a source's tile lies have become known since the last claim on them."""
+        pose = self._evidence.placement(source)
+        if pose is None:
+            return 0  # it is no part of the belief
+        column, row = key.column * TILE, key.row * TILE
+        if pose == IDENTITY:
+            return self._claim(column, row, column + TILE, row + TILE)
+        corners = np.array([[column + i * TILE, row + j * TILE] for i in range(2) for j in range(2)]) * CELL
+        placed = transform_points(pose, corners) / CELL
+        low, high = np.floor(placed.min(axis=0) - 1.0).astype(int), np.ceil(placed.max(axis=0) + 1.0).astype(int)
+        return self._claim(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+
+    def claim_all(self) -> int:
+        """Return how many cells of the whole map have become known since the last claim on them."""
+        self._evidence.placed()  # the grid may grow first
+        column, row = self._evidence.origin_cells
+        rows, columns = self._evidence.shape
+        return self._claim(column, row, column + columns, row + rows)
+
+    def _claim(self, column0: int, row0: int, column1: int, row1: int) -> int:
+        """Claim the cells of a rectangle of the map frame, its upper ends excluded; what lies off the grid is not."""
+        layers = self._evidence.placed()
+        self._follow_growth()
+        column, row = self._origin
+        window = (
+            slice(max(row0 - row, 0), max(row1 - row, 0)),
+            slice(max(column0 - column, 0), max(column1 - column, 0)),
+        )
+        known = self._known[window]
+        total = np.zeros(known.shape, np.int16)
+        for cells in layers.values():
+            total += cells[window]
+        fresh = (total != 0) & ~known
+        known |= fresh
+        return int(np.count_nonzero(fresh))
+
+    def _follow_growth(self) -> None:
+        origin, shape = self._evidence.origin_cells, self._evidence.shape
+        if origin == self._origin and shape == self._known.shape:
+            return
+        grown = np.zeros(shape, np.bool_)
+        column, row = self._origin[0] - origin[0], self._origin[1] - origin[1]
+        rows, columns = self._known.shape
+        grown[row : row + rows, column : column + columns] = self._known
+        self._origin, self._known = origin, grown
