@@ -50,6 +50,14 @@ def transform_points(pose: Pose, points: NDArray[np.float64]) -> NDArray[np.floa
     return moved
 
 
+def placed_bounds(
+    pose: Pose, x: tuple[float, float], y: tuple[float, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the least and the greatest x and y, `[2]` each, that a rectangle takes up once `pose` has placed it."""
+    placed = transform_points(pose, np.array([[at_x, at_y] for at_x in x for at_y in y], np.float64))
+    return placed.min(axis=0), placed.max(axis=0)
+
+
 def rotate(yaw: float, x: float, y: float) -> tuple[float, float]:
     """Rotate the vector (x, y) counter-clockwise by `yaw`."""
     c, s = math.cos(yaw), math.sin(yaw)

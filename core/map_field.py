@@ -105,13 +105,14 @@ class Fit(NamedTuple):
 
 def judge(reference: Field, peer: Field, pose: Pose) -> Fit:
     """Return how well `peer`, placed by `pose`, agrees with `reference`."""
-    forth = _compare(reference, transform_points(pose, peer.walls))
+    placed = transform_points(pose, peer.walls)
+    forth = _compare(reference, placed)
     back = _compare(peer, transform_points(inverse(pose), reference.walls))
     row, column, inside = _cells(reference, transform_points(pose, np.concatenate((peer.frees, peer.walls))))
     overlap = int(np.count_nonzero(reference.known[row[inside], column[inside]]))
     return Fit(
         (forth.matched + back.matched) / 2.0, (forth.contradicted + back.contradicted) / 2.0, overlap,
-        _hold(reference, transform_points(pose, peer.walls)),
+        _hold(reference, placed),
     )  # fmt: skip
 
 

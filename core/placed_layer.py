@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine.core.frames import Pose, inverse, transform_points
+from imagine.core.frames import Pose, inverse, placed_bounds
 from imagine.core.raster import CELL, TILE
 
 
@@ -59,19 +59,17 @@ class PlacedLayer:
             return None
         rows, columns = np.flatnonzero(is_row)[[0, -1]] + [0, 1], np.flatnonzero(is_column)[[0, -1]] + [0, 1]
         x, y = (columns + origin_cells[0]) * CELL, (rows + origin_cells[1]) * CELL
-        corners = np.array([[x[i], y[j]] for i in range(2) for j in range(2)], np.float64)
-        placed = transform_points(self.pose, corners)
-        low, high = placed.min(axis=0), placed.max(axis=0)
+        low, high = placed_bounds(self.pose, (x[0], x[1]), (y[0], y[1]))
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
     def _touch(self, touched: NDArray[np.bool_], row: int, column: int) -> None:
         """Mark the own tiles that a tile of the source falls on."""
         x0, y0 = (self._origin[0] + column * TILE) * CELL, (self._origin[1] + row * TILE) * CELL
         side = TILE * CELL
-        corners = np.array([[x0, y0], [x0 + side, y0], [x0, y0 + side], [x0 + side, y0 + side]])
-        placed = transform_points(self.pose, corners) / CELL - np.array(self._origin)
-        low = np.floor((placed.min(axis=0) - 1.0) / TILE).astype(int)
-        high = np.floor((placed.max(axis=0) + 1.0) / TILE).astype(int) + 1
+        least, most = placed_bounds(self.pose, (x0, x0 + side), (y0, y0 + side))
+        origin = np.array(self._origin)
+        low = np.floor((least / CELL - origin - 1.0) / TILE).astype(int)
+        high = np.floor((most / CELL - origin + 1.0) / TILE).astype(int) + 1
         touched[max(0, low[1]) : max(0, high[1]), max(0, low[0]) : max(0, high[0])] = True
 
 

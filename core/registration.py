@@ -60,34 +60,41 @@ def _step(
     """Return a step of Gauss-Newton (dx, dy, dyaw) about the peer's middle, metres and radians in the reference."""
     points = transform_points(pose, peer.walls)
     about = transform_points(pose, middle[None])[0]
-    distance = distances(reference, points)
-    weight = np.exp(-0.5 * (distance / sigma_m) ** 2)
-    rows = slopes(reference, points)
-    jacobian = np.column_stack((rows, rows[:, 1] * (points[:, 0] - about[0]) - rows[:, 0] * (points[:, 1] - about[1])))
-    normal = (jacobian * weight[:, None]).T @ jacobian
-    right = (jacobian * weight[:, None]).T @ distance
+    normal, right = _equations(slopes(reference, points), points - about, distances(reference, points), sigma_m)
     # the other way round: the reference's walls in the peer's field, their slope turned back into the reference
-    back = inverse(pose)
-    theirs = transform_points(back, reference.walls)
-    distance = distances(peer, theirs)
-    weight = np.exp(-0.5 * (distance / sigma_m) ** 2)
+    theirs = transform_points(inverse(pose), reference.walls)
     c, s = math.cos(pose.yaw), math.sin(pose.yaw)
-    rows = -slopes(peer, theirs) @ np.array([[c, s], [-s, c]])
-    lever = reference.walls - about
-    jacobian = np.column_stack((rows, rows[:, 1] * lever[:, 0] - rows[:, 0] * lever[:, 1]))
-    normal += (jacobian * weight[:, None]).T @ jacobian
-    right += (jacobian * weight[:, None]).T @ distance
-    normal += np.diag([1e-3, 1e-3, 1e-3])
-    step: NDArray[np.float64] = -np.linalg.solve(normal, right)
+    turned_back = -slopes(peer, theirs) @ np.array([[c, s], [-s, c]])
+    more_normal, more_right = _equations(turned_back, reference.walls - about, distances(peer, theirs), sigma_m)
+    held = np.diag([1e-3, 1e-3, 1e-3])  # where the walls leave a way free
+    step = -np.linalg.solve(normal + more_normal + held, right + more_right)
     limit = max(1.0, math.hypot(step[0], step[1]) / sigma_m, abs(step[2]) / math.radians(3.0))
-    step /= limit
-    return step
+    limited: NDArray[np.float64] = step / limit
+    return limited
+
+
+def _equations(
+    slope: NDArray[np.float64], lever: NDArray[np.float64], distance: NDArray[np.float64], sigma_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the normal equations, `[3, 3]` and `[3]`, of walls by slopes and levers `[n, 2]` and distances."""
+    weight = np.exp(-0.5 * (distance / sigma_m) ** 2)
+    jacobian = np.column_stack((slope, slope[:, 1] * lever[:, 0] - slope[:, 0] * lever[:, 1]))
+    weighted = (jacobian * weight[:, None]).T
+    normal: NDArray[np.float64] = weighted @ jacobian
+    right: NDArray[np.float64] = weighted @ distance
+    return normal, right
+
+
+def difference(a: Pose, b: Pose, middle: NDArray[np.float64]) -> tuple[float, float]:
+    """Return how far apart two poses lay the peer's `middle` (`[2]`, metres), and the angle between them, radians."""
+    shift = transform_points(a, middle[None])[0] - transform_points(b, middle[None])[0]
+    return math.hypot(shift[0], shift[1]), abs(wrap_angle(a.yaw - b.yaw))
 
 
 def are_apart(a: Pose, b: Pose, middle: NDArray[np.float64]) -> bool:
     """Tell whether two poses are different answers: they lay the peer's `middle` apart, or turn it otherwise."""
-    shift = transform_points(a, middle[None])[0] - transform_points(b, middle[None])[0]
-    return math.hypot(shift[0], shift[1]) > _APART_M or abs(wrap_angle(a.yaw - b.yaw)) > _APART_RAD
+    shift_m, turn = difference(a, b, middle)
+    return shift_m > _APART_M or turn > _APART_RAD
 
 
 class Within(NamedTuple):

@@ -24,6 +24,7 @@ from imagine.mesh_comm.keys import start_sealer
 from imagine.mesh_comm.link_url import FORMS
 from imagine.mesh_comm.links import open_link
 from imagine.mesh_comm.messages import GROUND
+from imagine.mesh_comm.namesake import ANSWER_S
 from imagine.mesh_comm.settings import MeshSettings
 from imagine.mesh_comm.udp_modem import UdpModemLink
 from imagine.mesh_comm.udp_network import UdpNetworkLink
@@ -32,7 +33,6 @@ logger = logging.getLogger(__name__)
 
 _LOOP_S = 0.05
 _SNAPSHOT_S = 0.2
-_CLAIMING_S = 2.0
 
 
 class StationSettings(Settings):
@@ -86,7 +86,7 @@ def _loop(
         for datagram in link.receive():
             fleet.receive(datagram, now)
         if fleet.node.has_namesake:  # the other one must hear of it before this one ends
-            refused_at = min(refused_at, now + _CLAIMING_S)
+            refused_at = min(refused_at, now + ANSWER_S)
         if now >= refused_at:
             raise WorkError("another ground station is on the air, and drones heed only the one started last: end both")
         obey(fleet, server, now)

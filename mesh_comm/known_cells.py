@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from imagine.core.evidence import EvidenceMap, TileKey
-from imagine.core.frames import IDENTITY, transform_points
+from imagine.core.frames import IDENTITY, placed_bounds
 from imagine.core.raster import CELL, TILE
 
 
@@ -37,9 +37,9 @@ class KnownCells:
         column, row = key.column * TILE, key.row * TILE
         if pose == IDENTITY:
             return self._claim(column, row, column + TILE, row + TILE)
-        corners = np.array([[column + i * TILE, row + j * TILE] for i in range(2) for j in range(2)]) * CELL
-        placed = transform_points(pose, corners) / CELL
-        low, high = np.floor(placed.min(axis=0) - 1.0).astype(int), np.ceil(placed.max(axis=0) + 1.0).astype(int)
+        x, y = (column * CELL, (column + TILE) * CELL), (row * CELL, (row + TILE) * CELL)
+        least, most = placed_bounds(pose, x, y)
+        low, high = np.floor(least / CELL - 1.0).astype(int), np.ceil(most / CELL + 1.0).astype(int)
         return self._claim(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
     def claim_all(self) -> int:

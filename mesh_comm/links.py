@@ -6,10 +6,8 @@ from collections import deque
 from typing import Protocol
 
 from imagine.mesh_comm.link_url import parse_link_url
-from imagine.mesh_comm.udp_modem import UdpModemLink
+from imagine.mesh_comm.udp_modem import INBOX, UdpModemLink
 from imagine.mesh_comm.udp_network import UdpNetworkLink
-
-_INBOX = 2048  # datagrams kept while nobody reads: the oldest go first
 
 
 class MeshLink(Protocol):
@@ -48,7 +46,7 @@ class VirtualLink:
         """Join the medium; use `VirtualAir.link` instead."""
         self.air = air
         self.index = index
-        self.inbox: deque[bytes] = deque(maxlen=_INBOX)
+        self.inbox: deque[bytes] = deque(maxlen=INBOX)
 
     def send(self, datagram: bytes) -> None:
         """Put the datagram into the inbox of every other link in reach."""

@@ -13,7 +13,8 @@ import math
 import struct
 
 _PERIOD_S = 0.5
-_ANSWER_S = 2.0  # claims are repeated for so long, for the radio loses some
+ANSWER_S = 2.0
+"""Claims are repeated for so long, for the radio loses some; who goes because of a namesake goes no sooner."""
 _MOST_NAMED = 4  # boot numbers in a claim; of more, those heard last
 _BOOT = struct.Struct(">I")
 
@@ -36,7 +37,7 @@ class NamesakeWatch:
             self.is_proven = True
         if boot > self._boot or names_this_life:
             self._to_name.pop(boot, None)
-            self._to_name[boot] = now + _ANSWER_S
+            self._to_name[boot] = now + ANSWER_S
             if len(self._to_name) > _MOST_NAMED:
                 del self._to_name[next(iter(self._to_name))]
 

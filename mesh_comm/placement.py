@@ -16,9 +16,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from imagine.core.evidence import EvidenceMap
-from imagine.core.frames import IDENTITY, Pose, compose, relative, transform_points, wrap_angle
+from imagine.core.frames import IDENTITY, Pose, compose, relative
 from imagine.core.map_field import Field, Fit, field_of, judge
-from imagine.core.registration import Hypothesis, Search, Within, are_apart, refine
+from imagine.core.registration import Hypothesis, Search, Within, are_apart, difference, refine
 from imagine.mesh_comm.alignment import AlignmentSettings
 from imagine.mesh_comm.messages import GROUND
 
@@ -242,7 +242,7 @@ class Placements:
         track.strikes, track.fit = 0, fit
         if are_apart(pose, held, peer.centre) or not self._is_sound(moved) or moved.score < fit.score:
             return []
-        shift, turn = _difference(pose, held, peer)
+        shift, turn = difference(pose, held, peer.centre)
         if shift < settings.move_m and turn < settings.move_rad:
             return []
         track.fit = moved
@@ -262,12 +262,5 @@ class Placements:
         return [source]
 
     def _agree(self, a: Pose, b: Pose, peer: Field) -> bool:
-        shift, turn = _difference(a, b, peer)
+        shift, turn = difference(a, b, peer.centre)
         return shift <= self._settings.agree_m and turn <= self._settings.agree_rad
-
-
-def _difference(a: Pose, b: Pose, peer: Field) -> tuple[float, float]:
-    """Return how far apart two poses lay the middle of the peer's walls, metres, and their angle, radians."""
-    middle = peer.centre[None]
-    shift = transform_points(a, middle)[0] - transform_points(b, middle)[0]
-    return math.hypot(shift[0], shift[1]), abs(wrap_angle(a.yaw - b.yaw))

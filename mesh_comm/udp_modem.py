@@ -15,7 +15,8 @@ from imagine.mesh_comm.udp_sockets import open_socket, resolve
 
 HELLO = b"IMHI"
 """Sent to a radio modem so that it learns the node's address; carries nothing."""
-_INBOX = 2048  # datagrams kept while nobody reads: the oldest go first
+INBOX = 2048
+"""Datagrams kept while nobody reads: the oldest go first."""
 _MOST_READS = 1000  # in one go, so that a flood cannot hold the loop
 _HELLO_PERIOD_S = 0.5
 _TICK_TOLERANCE_S = 1e-6
@@ -40,7 +41,7 @@ class UdpModemLink:
         except OSError as error:
             self._socket.close()
             raise InputError(f"{url}: the radio cannot be reached: {error.strerror or error}") from error
-        self._inbox: deque[bytes] = deque(maxlen=_INBOX)
+        self._inbox: deque[bytes] = deque(maxlen=INBOX)
         self._marker = -math.inf
         self._is_lockstep = False
         self._is_heard = False

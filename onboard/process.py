@@ -20,6 +20,7 @@ from types import FrameType
 from imagine.core.errors import InputError, WorkError
 from imagine.core.lidar import Scan
 from imagine.mesh_comm.links import MeshLink, open_link
+from imagine.mesh_comm.namesake import ANSWER_S
 from imagine.mesh_comm.udp_modem import UdpModemLink
 from imagine.mesh_comm.udp_network import UdpNetworkLink
 from imagine.onboard.autopilot import Autopilot
@@ -39,7 +40,6 @@ _SCAN_WAIT_S = 0.1  # how long the loop sleeps at most: bounds the answer to a s
 _NO_SCAN_TICK_S = 0.25  # without scans the runner still ticks this often, to hold, land and tell
 _ENDING_S = 20.0  # from the request to end until the process goes, landed or not
 _ENDING_SILENT_S = 0.6  # and this long, if no scans come either: there is nothing left to fly by
-_CLAIMING_S = 2.0  # on the ground, so long is told on the air that another drone has this one's id
 _RELEASED_S = 60.0
 
 
@@ -222,7 +222,7 @@ class Loop:
             return True
         if self._final_at is None or self.settings.stay:
             return False
-        if self.runner.mesh is not None and self.runner.mesh.has_namesake and now - self._final_at < _CLAIMING_S:
+        if self.runner.mesh is not None and self.runner.mesh.has_namesake and now - self._final_at < ANSWER_S:
             return False  # the other one must hear of it
         down = phase is not Phase.RELEASED or self.runner.is_disarmed
         return down or now - self._final_at > _RELEASED_S

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from imagine.core.frames import Pose
 from imagine.core.raster import CELL
-from imagine.sim.clairvoyant_kernels import bits, mark_seen, quickest
+from imagine.sim.clairvoyant_kernels import TICKS_PER_S, bits, mark_seen, quickest
 from imagine.sim.level import Level
 from imagine.sim.level_survey import SIGHT_M, cell_centres
 
@@ -49,12 +49,11 @@ class Clairvoyant:
         self._points = cell_centres(rows * _EVERY, columns * _EVERY, level.grid)
         self._ways = _ways(level.flyable, rows * _EVERY, columns * _EVERY)
         ids = np.full(level.coverable.shape, -1, np.int32)
-        wanted = level.coverable.astype(bool)
-        self._cells = int(wanted.sum())
-        ids[wanted] = np.arange(self._cells)
+        self._cells = int(level.coverable.sum())
+        ids[level.coverable] = np.arange(self._cells)
         self._seen = np.zeros((len(self._points), (self._cells + 63) // 64), np.uint64)
         segments, circles = level.segments, level.geometry.circles
-        mark_seen(self._seen, ids, self._points, segments, circles, sight_m, _BEAMS, column0, row0, CELL)
+        mark_seen(self._seen, ids, self._points, segments, circles, sight_m, _BEAMS, column0, row0)
 
     def floor(
         self, launch: list[Pose], speed_mps: float = 0.8, share: float = 0.9, tries: int = 60_000, seed: int = 0
@@ -81,7 +80,7 @@ class Clairvoyant:
         if low == len(order) or not np.isfinite(metres[order[low]]):
             return math.inf
         apart = math.sqrt(2.0) * _EVERY * CELL  # both ends may lie so far from the lattice, together
-        return max(0.0, float(metres[order[low]]) / _DETOUR - apart) / speed_mps * 10.0
+        return max(0.0, float(metres[order[low]]) / _DETOUR - apart) / speed_mps * TICKS_PER_S
 
 
 def _ways(flyable: NDArray[np.bool_], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> csr_matrix:

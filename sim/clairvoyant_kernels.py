@@ -7,15 +7,17 @@ import math
 import numba
 import numpy as np
 
+from imagine.core.raster import CELL
+from imagine.sim.dynamics import TICK_S
 from imagine.sim.rays import cast_rays
 
-_TICKS_PER_S = 10.0
+TICKS_PER_S = round(1.0 / TICK_S)
 _NOWHERE = 1e9
 _STEP_M = 0.05  # along a beam, half a cell
 
 
 @numba.njit(cache=True, nogil=True)
-def mark_seen(seen, ids, points, segments, circles, reach_m, beams, column0, row0, cell_m):  # type: ignore[no-untyped-def]
+def mark_seen(seen, ids, points, segments, circles, reach_m, beams, column0, row0):  # type: ignore[no-untyped-def]
     """Set in `seen` (uint64 `[points, words]`) the bits of the cells each of `points` `[n, 2]` sees within `reach_m`.
 
     `ids` int32 `[rows, columns]` numbers the cells that count, from cell (column0, row0); others are below 0.
@@ -30,8 +32,8 @@ def mark_seen(seen, ids, points, segments, circles, reach_m, beams, column0, row
             cosine, sine = math.cos(angle), math.sin(angle)
             for step in range(int(min(ranges[beam], reach_m) / _STEP_M)):
                 along = step * _STEP_M
-                column = math.floor((x + along * cosine) / cell_m) - column0
-                row = math.floor((y + along * sine) / cell_m) - row0
+                column = math.floor((x + along * cosine) / CELL) - column0
+                row = math.floor((y + along * sine) / CELL) - row0
                 if 0 <= row < rows and 0 <= column < columns and ids[row, column] >= 0:
                     seen[k, ids[row, column] >> 6] |= np.uint64(1) << np.uint64(ids[row, column] & 63)
 
@@ -41,10 +43,16 @@ def bits(words):  # type: ignore[no-untyped-def]
     """Return how many bits of uint64 `words` are set."""
     count = 0
     for word in words:
-        left = word
-        while left:
-            left &= left - np.uint64(1)
-            count += 1
+        count += _ones(word)
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _ones(word):  # type: ignore[no-untyped-def]
+    count = 0
+    while word:
+        word &= word - np.uint64(1)
+        count += 1
     return count
 
 
@@ -66,7 +74,7 @@ def covered_after(way, lengths, starts, nodes, far, before, seen, needed, speed,
                 onward = before[waypoint, at]
                 metres += far[waypoint, at] - far[waypoint, onward]
                 at = onward
-                tick = math.ceil(metres / speed * _TICKS_PER_S)
+                tick = math.ceil(metres / speed * TICKS_PER_S)
                 if tick <= most_ticks:
                     passed[drone, tick] = at
     known = np.zeros(seen.shape[1], np.uint64)
@@ -81,9 +89,7 @@ def covered_after(way, lengths, starts, nodes, far, before, seen, needed, speed,
                     new = seen[at, word] & ~known[word]
                     if new:
                         known[word] |= new
-                        while new:
-                            new &= new - np.uint64(1)
-                            count += 1
+                        count += _ones(new)
         if count >= needed:
             return float(tick)
     return most_ticks * (1.0 + (needed - count) / needed)

@@ -8,6 +8,7 @@ for in the other, as the mesh does. Pairs: of one flight, of two flights of a le
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import time
 from collections import Counter
@@ -223,8 +224,7 @@ def summary(trials: list[Trial]) -> Results:
         ("asymmetric", [t for t in fitting if t.level not in SYMMETRIC]),
         ("symmetric", [t for t in fitting if t.level in SYMMETRIC]),
     ):
-        for low in (0.0, 0.1, 0.3, 0.5, 0.7, 0.9):
-            high = {0.0: 0.1, 0.1: 0.3, 0.3: 0.5, 0.5: 0.7, 0.7: 0.9, 0.9: 1.01}[low]
+        for low, high in itertools.pairwise((0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)):
             at = [look.trusted for trial in among for look in trial.looks if low <= look.share < high]
             put(f"trusted_{what}_from_{low:.1f}", _mean(at), "share", attempts=len(at))
         put(f"trusted_{what}_at_the_end", _mean([t.looks[-1].trusted for t in among]), "share")

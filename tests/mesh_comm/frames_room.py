@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from flat_rooms import look
 from numpy.typing import NDArray
 from radio_room import CAP_M, LIDAR, Drone
 
 from imagine.core.frames import Pose, compose, inverse
-from imagine.core.lidar import Scan
 from imagine.mesh_comm.messages import Status
 
 FLAT = np.array([
@@ -40,19 +40,6 @@ def along(way: list[tuple[float, float]], metres: float) -> tuple[float, float]:
     return way[0]
 
 
-def flat_scan(pose: Pose, stamp: float, walls: NDArray[np.float64] = FLAT) -> Scan:
-    """Return the scan taken at a pose of the flat's own frame."""
-    bearing = (LIDAR.bearings + pose.yaw)[:, None]
-    ux, uy = np.cos(bearing), np.sin(bearing)
-    ax, ay = walls[:, 0] - pose.x, walls[:, 1] - pose.y
-    ex, ey = walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1]
-    facing = ux * ey - uy * ex
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reach, share = (ax * ey - ay * ex) / facing, (ax * uy - ay * ux) / facing
-        hit = (reach >= 0.0) & (share >= 0.0) & (share <= 1.0)
-    return Scan(stamp, np.where(hit, reach, np.inf).min(axis=1).astype(np.float32))
-
-
 class Stranger:
     """A drone on its way through the flat, that knows where it is only in the frame it began in."""
 
@@ -66,7 +53,7 @@ class Stranger:
         self._at += speed_mps * dt
         self.true = Pose(*along(way, self._at), 0.3 * math.sin(0.2 * now))
         pose, node = compose(inverse(self.frame), self.true), self.drone.node
-        scan = flat_scan(self.true, now, self._walls)
+        scan = look(self._walls, self.true, LIDAR, now)
         self.drone.evidence.integrate(pose, scan, LIDAR, CAP_M)
         node.set_status(Status(node.id, now, pose, velocity=(0.1, 0.0), ladder="policy"))
         node.offer_scan(scan, pose, now)

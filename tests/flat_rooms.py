@@ -1,4 +1,4 @@
-"""Rooms with straight walls for the core's tests, and what a noiseless LiDAR measures in them."""
+"""Rooms with straight walls for tests of maps, and what a noiseless LiDAR measures in them."""
 
 from __future__ import annotations
 
