@@ -1,122 +1,131 @@
-"""Small binary forms of scans, tiles and version lists, compressed with zstandard and checked when read."""
+"""Small binary forms of scans, tiles and version lists: range-coded, exact, and alike on every machine.
+
+What is packed is told in whole numbers alone (`scan_model`, `tile_model`, `version_model`, by `range_coder`), and no
+bytes, however damaged, take more time or memory to read than sound ones.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
-from imagine.core.evidence import MAX_TILES, TileKey
-from imagine.core.raster import LIMIT, TILE
+from imagine.core.evidence import TileKey
+from imagine.core.raster import LIMIT, RANGE_STEP_M, TILE
+from imagine.mesh_comm.chances import load_chances
+from imagine.mesh_comm.range_coder import MOST_NUMBER_STEPS, ONE, encode_steps
+from imagine.mesh_comm.scan_model import FIRST_RANGE, INVALID, MOST_BEAM_STEPS, NO_RETURN, decode_scan, scan_steps
+from imagine.mesh_comm.tile_model import MOST_TILE_STEPS, PLAIN_TILE_BYTES, decode_tile, plain_tile_steps, tile_steps
+from imagine.mesh_comm.version_model import (
+    MOST_ENTRY_STEPS,
+    MOST_LISTED,
+    TILES_A_BYTE,
+    VERSION_CONTEXTS,
+    decode_count,
+    decode_entries,
+    version_steps,
+)
 
-RANGE_STEP_M = 0.01
-"""Ranges are rounded to the centimetre: an error of 5 mm at most, half the reference sensor's noise."""
-_INVALID, _NO_RETURN = 0, 1
-_FIRST = 2  # codes from here on are ranges, in steps
-_MAX_VERSIONS = MAX_TILES**2  # no map holds more
-
-_compressor = zstandard.ZstdCompressor(level=9, write_checksum=False)
-_decompressor = zstandard.ZstdDecompressor()
+_CHANCES = load_chances()
+_SPARE_BYTES = 8  # what the coder wants free behind its last byte
+_MOST_BEAM_BYTES = 24  # no step takes more than 11 bits: two of kind, 12 and 11 of a size up to 3000, one of sign
+_MOST_ENTRY_BYTES = 192  # three numbers, each of at most 40 steps that learn, and 39 digits
 
 
 def pack_ranges(ranges: NDArray[np.float32], range_min: float, range_cap: float) -> bytes:
-    """Return ranges as bytes: to the centimetre, beyond `range_cap` as no return, below `range_min` as invalid.
+    """Return ranges as bytes: to the centimetre, beyond `range_cap` as no return, below `range_min` as invalid."""
+    codes = range_codes(ranges, range_min, range_cap)
+    steps = np.empty(MOST_BEAM_STEPS * len(codes), np.int16)
+    count = scan_steps(codes, largest_code(range_cap), steps)
+    out = np.empty(_MOST_BEAM_BYTES * len(codes) + _SPARE_BYTES, np.uint8)
+    return out[: encode_steps(steps, count, _CHANCES.scan.copy(), True, out)].tobytes()
 
-    Differences between neighbouring beams are small and cluster around zero; low and high bytes are kept apart.
-    """
+
+def range_codes(ranges: NDArray[np.float32], range_min: float, range_cap: float) -> NDArray[np.int64]:
+    """Return what ranges in metres are sent as: 0 invalid, 1 no return, or centimetres plus 2; int64 `[beams]`."""
     r = ranges.astype(np.float64)
     with np.errstate(invalid="ignore"):
         measured = (r >= range_min) & (r <= range_cap)
-        codes = np.where(r > range_cap, _NO_RETURN, _INVALID).astype(np.uint16)
+        codes = np.where(r > range_cap, NO_RETURN, INVALID).astype(np.int64)
     # never rounded past the cap: a hit just inside it must not turn into free space
-    steps = np.clip(np.rint(r[measured] / RANGE_STEP_M), 1, np.floor(range_cap / RANGE_STEP_M + 1e-9))
-    codes[measured] = steps.astype(np.uint16) + _FIRST
-    difference = np.diff(codes, prepend=np.uint16(0)).view(np.int16)
-    zigzag = ((difference << 1) ^ (difference >> 15)).view(np.uint16)
-    return _compress(_planes(zigzag))
+    steps = np.clip(np.rint(r[measured] / RANGE_STEP_M), 1, largest_code(range_cap) - FIRST_RANGE)
+    codes[measured] = steps.astype(np.int64) + FIRST_RANGE
+    return codes
 
 
 def unpack_ranges(packed: bytes, beams: int, range_cap: float) -> NDArray[np.float32]:
     """Return `[beams]` ranges in metres, no return = inf, invalid = nan.
 
-    Raises InputError on damaged bytes and on ranges beyond `range_cap`.
+    Raises InputError on bytes left over and on ranges beyond `range_cap`.
     """
-    zigzag = _from_planes(_decompress(packed, 2 * beams), np.dtype("<u2"))
-    difference = (zigzag >> 1).view(np.int16) ^ -(zigzag & 1).view(np.int16)
-    codes = np.cumsum(difference, dtype=np.int16).view(np.uint16)
-    if codes.max() > range_cap / RANGE_STEP_M + _FIRST + 0.5:
-        raise InputError(f"mesh scan holds ranges beyond its cap of {range_cap} m")
-    metres = np.minimum((codes.astype(np.float64) - _FIRST) * RANGE_STEP_M, range_cap)
-    ranges: NDArray[np.float32] = metres.astype(np.float32)
-    ranges[codes == _INVALID] = np.nan
-    ranges[codes == _NO_RETURN] = np.inf
+    codes = np.empty(beams, np.int64)
+    if not decode_scan(np.frombuffer(packed, np.uint8), _CHANCES.scan.copy(), largest_code(range_cap), codes):
+        raise InputError(f"mesh scan: {len(packed)} bytes do not tell {beams} ranges up to {range_cap} m")
+    ranges: NDArray[np.float32] = _metres(range_cap)[codes]
     return ranges
 
 
 def pack_tile(cells: NDArray[np.int8]) -> bytes:
-    """Return the cells of a tile, int8 `[TILE, TILE]`, as bytes."""
-    return _compress(np.ascontiguousarray(cells).tobytes())
+    """Return the cells of a tile, int8 `[TILE, TILE]` within ±LIMIT, as bytes; none packs into more than a datagram."""
+    if cells.shape != (TILE, TILE) or cells.dtype != np.int8 or cells.max() > LIMIT or cells.min() < -LIMIT:
+        raise InputError(f"mesh tile of {cells.dtype} {cells.shape}, expected int8 {TILE}x{TILE} within ±{LIMIT}")
+    cells = np.ascontiguousarray(cells)
+    steps = np.empty(MOST_TILE_STEPS, np.int16)
+    out = np.empty(PLAIN_TILE_BYTES + _SPARE_BYTES, np.uint8)
+    size = encode_steps(steps, tile_steps(cells, steps), _CHANCES.tile, False, out)
+    if not 0 <= size < PLAIN_TILE_BYTES:
+        size = encode_steps(steps, plain_tile_steps(cells, steps), _CHANCES.tile, False, out)
+    return out[:size].tobytes()
 
 
 def unpack_tile(packed: bytes) -> NDArray[np.int8]:
-    """Return the cells of a tile, int8 `[TILE, TILE]`. Raises InputError on damaged bytes or evidence out of range."""
-    cells = np.frombuffer(_decompress(packed, TILE * TILE), np.int8).reshape(TILE, TILE)
-    if cells.max() > LIMIT or cells.min() < -LIMIT:
-        raise InputError(f"mesh tile holds evidence beyond ±{LIMIT}")
+    """Return the cells of a tile, int8 `[TILE, TILE]` within ±LIMIT. Raises InputError on bytes that tell no tile."""
+    cells = np.empty((TILE, TILE), np.int8)
+    if not decode_tile(np.frombuffer(packed, np.uint8), _CHANCES.tile, cells):
+        raise InputError(f"mesh tile: {len(packed)} bytes do not tell {TILE}x{TILE} cells within ±{LIMIT}")
     return cells
 
 
 def pack_versions(versions: Mapping[TileKey, int]) -> bytes:
-    """Return tile versions as bytes, sorted by key; keys as differences, which are mostly 0 and 1."""
-    keys = sorted(versions)
-    places = np.array(keys, np.int16).reshape(-1, 2)
-    steps = np.diff(places, axis=0, prepend=np.zeros((1, 2), np.int16))
-    numbers = np.array([versions[key] for key in keys], np.uint32)
-    return _compress(_planes(steps[:, 0]) + _planes(steps[:, 1]) + _planes(numbers))
+    """Return at most `MOST_LISTED` tile versions, each below 2^32, as bytes."""
+    entries = np.array([(*key, versions[key]) for key in sorted(versions)], np.int64).reshape(-1, 3)
+    count = len(entries)
+    if count > MOST_LISTED:
+        raise InputError(f"mesh version list of {count} tiles, expected {MOST_LISTED} at most: split it")
+    steps = np.empty(MOST_NUMBER_STEPS + count * MOST_ENTRY_STEPS, np.int16)
+    out = np.empty((1 + count) * _MOST_ENTRY_BYTES, np.uint8)
+    size = encode_steps(steps, version_steps(entries, steps), _even_odds(VERSION_CONTEXTS), True, out)
+    return out[:size].tobytes().ljust((count - 1) // TILES_A_BYTE, b"\0")
 
 
 def unpack_versions(packed: bytes) -> dict[TileKey, int]:
-    """Return the tile versions of `pack_versions`. Raises InputError on damaged bytes."""
-    raw = _decompress(packed, None, limit=8 * _MAX_VERSIONS)
-    if len(raw) % 8:
-        raise InputError(f"mesh version list of {len(raw)} bytes is cut off")
-    count = len(raw) // 8
-    columns = np.cumsum(_from_planes(raw[: 2 * count], np.dtype("<i2")), dtype=np.int16)
-    rows = np.cumsum(_from_planes(raw[2 * count : 4 * count], np.dtype("<i2")), dtype=np.int16)
-    numbers = _from_planes(raw[4 * count :], np.dtype("<u4"))
-    if count and max(abs(places).max() for places in (columns.astype(int), rows.astype(int))) > MAX_TILES:
-        raise InputError("mesh version list holds a tile that no map can hold")
-    entries = zip(columns.tolist(), rows.tolist(), numbers.tolist(), strict=True)
-    return {TileKey(column, row): version for column, row, version in entries}
+    """Return the tile versions of `pack_versions`. Raises InputError on bytes that tell no list."""
+    data, zeros, state = np.frombuffer(packed, np.uint8), _even_odds(VERSION_CONTEXTS), np.empty(4, np.int64)
+    count = int(decode_count(data, zeros, state))
+    if count > min(TILES_A_BYTE * (len(packed) + 1), MOST_LISTED):
+        raise InputError(f"mesh version list: {len(packed)} bytes claim to tell of {count} tiles")
+    entries = np.empty((count, 3), np.int64)
+    if not decode_entries(data, zeros, state, entries):
+        raise InputError(f"mesh version list: {len(packed)} bytes do not tell of {count} tiles that a map can hold")
+    return {TileKey(column, row): version for column, row, version in entries.tolist()}
 
 
-def _planes(values: NDArray[np.int16] | NDArray[np.uint16] | NDArray[np.uint32]) -> bytes:
-    """Return little-endian values with all lowest bytes first, then the next: high bytes repeat and compress away."""
-    little = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
-    return little.view(np.uint8).reshape(len(values), values.itemsize).T.tobytes()
+@lru_cache(maxsize=8)
+def _metres(range_cap: float) -> NDArray[np.float32]:
+    """Return the range in metres of every code up to the largest."""
+    steps = np.arange(largest_code(range_cap) + 1) - FIRST_RANGE
+    metres: NDArray[np.float32] = np.minimum(steps * RANGE_STEP_M, range_cap).astype(np.float32)
+    metres[INVALID], metres[NO_RETURN] = np.nan, np.inf
+    return metres
 
 
-def _from_planes(raw: bytes, dtype: np.dtype[np.generic]) -> NDArray[np.uint16]:
-    planes = np.frombuffer(raw, np.uint8).reshape(dtype.itemsize, -1)
-    return np.ascontiguousarray(planes.T).view(dtype).reshape(-1)
+def largest_code(range_cap: float) -> int:
+    """Return the greatest code of a range up to `range_cap` metres."""
+    return int(np.floor(range_cap / RANGE_STEP_M + 1e-9)) + FIRST_RANGE
 
 
-def _compress(raw: bytes) -> bytes:
-    return _compressor.compress(raw)
-
-
-def _decompress(packed: bytes, size: int | None, limit: int = 0) -> bytes:
-    """Decompress to exactly `size` bytes (None: at most `limit`), refusing before it allocates more."""
-    try:
-        declared = zstandard.frame_content_size(packed)
-        if declared < 0 or (declared > limit if size is None else declared != size):
-            raise InputError(f"mesh message holds {declared} packed bytes, expected {size if size else f'<= {limit}'}")
-        raw = _decompressor.decompress(packed, max_output_size=max(1, declared))
-    except zstandard.ZstdError as error:
-        raise InputError(f"mesh message holds bytes that do not decompress: {error}") from error
-    if len(raw) != declared:
-        raise InputError("mesh message holds packed bytes that are cut off")
-    return raw
+def _even_odds(contexts: int) -> NDArray[np.int64]:
+    return np.full(contexts, ONE // 2, np.int64)

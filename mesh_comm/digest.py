@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from imagine.core.evidence import TileKey
 from imagine.mesh_comm.codec import pack_versions
 from imagine.mesh_comm.messages import Digest, Holding
+from imagine.mesh_comm.version_model import MOST_LISTED
 
 _HOLDING_BYTES = 24  # a holding beside its packed list: source, two keys and lengths, at their longest
 _DIGEST_BYTES = 24  # version byte, tag, stamp and lengths
@@ -42,8 +43,7 @@ def _split(
     max_packed: int,
 ) -> list[Holding]:
     """Halve a list of tiles until each part, with the interval of keys it speaks for, is small enough."""
-    packed = pack_versions(dict(items))
-    if len(packed) <= max_packed:
+    if len(items) <= MOST_LISTED and len(packed := pack_versions(dict(items))) <= max_packed:
         return [Holding(source, after, until, packed)]
     middle = len(items) // 2
     border = items[middle - 1][0]

@@ -1,13 +1,14 @@
 """The messages that drones and ground exchange, and their binary form: a version byte, then MessagePack.
 
 Structs travel as arrays with the tag first, so a newer sender may append fields that an older receiver ignores, and
-an older sender may leave out fields that have defaults. Units: metres, seconds, radians, map frame.
+an older sender may leave out fields that have defaults. A newer sender may also send kinds that an older receiver does
+not know. What an older receiver would misread takes a new version. Units: metres, seconds, radians, map frame.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, get_args
 
 import msgspec
 import numpy as np
@@ -20,7 +21,8 @@ from imagine.core.raster import CELL, TILE
 
 MAX_DATAGRAM = 1200
 """Largest sealed datagram, bytes: passes every link unfragmented (IPv6's smallest MTU is 1280)."""
-WIRE_VERSION = 1
+WIRE_VERSION = 2
+"""Of messages and of what is packed in them (`codec`, `chances.json`); others are refused."""
 GROUND = 0
 """Id of the ground station, which listens, shows and commands, and never writes a map."""
 POSITION_LIMIT_M = MAX_TILES * TILE * CELL / 2
@@ -132,6 +134,19 @@ class Command(Struct, tag=5, array_like=True, frozen=True):
 ACTIONS = ("hold", "land", "resume")
 
 Message = Scan | Tiles | Digest | Status | Command
+_FIELDS = {kind.__struct_config__.tag: 1 + len(kind.__struct_fields__) for kind in get_args(Message)}
+
+
+class Unreadable(InputError):
+    """A message that was not read; `reason` is one word for the counters: malformed, version or kind.
+
+    `version`: another `WIRE_VERSION`. `kind`: one that newer senders know, so nothing is wrong with it.
+    """
+
+    def __init__(self, reason: str, message: str) -> None:
+        """Keep the counter's name beside the message."""
+        super().__init__(message)
+        self.reason = reason
 
 
 def _plain(value: object) -> object:
@@ -151,15 +166,46 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes) -> Message:
-    """Read and check a message. Raises InputError on anything truncated, malformed, or out of bounds."""
+    """Read and check a message.
+
+    Raises Unreadable on another version, on an unknown kind, and on anything truncated, malformed, or out of bounds.
+    """
     if not data or data[0] != WIRE_VERSION:
-        raise InputError(f"mesh message of wire version {data[0] if data else 'none'}, expected {WIRE_VERSION}")
+        version = data[0] if data else "none"
+        raise Unreadable("version", f"mesh message of wire version {version}, expected {WIRE_VERSION}")
+    kind, _ = _array(data)
+    if kind is not None and kind not in _FIELDS:
+        raise Unreadable("kind", f"mesh message of kind {kind}, known are {', '.join(map(str, _FIELDS))}")
     try:
         message = _decoder.decode(memoryview(data)[1:])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"mesh message cannot be read: {error}") from error
+        raise Unreadable("malformed", f"mesh message cannot be read: {error}") from error
     _check(message)
     return message
+
+
+def newer_fields(data: bytes) -> int:
+    """Return how many fields a sound message has, beyond those of its kind that are known here."""
+    kind, fields = _array(data)
+    return max(0, fields - _FIELDS[kind]) if kind in _FIELDS else 0
+
+
+def _array(data: bytes) -> tuple[int | None, int]:
+    """Return the kind of a message, None where it has none, and how many elements its array has."""
+    match data[1:2]:
+        case b"":
+            return None, 0
+        case b"\xdc":
+            fields, at = int.from_bytes(data[2:4], "big"), 4
+        case b"\xdd":
+            fields, at = int.from_bytes(data[2:6], "big"), 6
+        case header:
+            fields, at = (header[0] & 0x0F if header[0] & 0xF0 == 0x90 else 0), 2
+    if data[at : at + 1] == b"\xcc":  # a byte of its own for numbers from 128
+        at += 1
+    elif data[at : at + 1] >= b"\x80":
+        return None, fields
+    return (data[at] if fields > 0 and at < len(data) else None), fields
 
 
 def tile_key(tile: Tile) -> TileKey:
@@ -179,9 +225,13 @@ def _check(message: Message) -> None:
             _check_pose(message.pose)
             turn = 2.0 * math.pi + 1e-3
             if not (0.0 < message.increment <= turn and message.increment * message.beams <= turn):
-                raise InputError(f"mesh scan: increment {message.increment} rad with {message.beams} beams")
+                raise Unreadable(
+                    "malformed", f"mesh scan: increment {message.increment} rad with {message.beams} beams"
+                )
             if not (abs(message.start) <= turn and 0.0 < message.range_cap_m <= MAX_RANGE_CAP_M):
-                raise InputError(f"mesh scan: start {message.start} rad, range cap {message.range_cap_m} m")
+                raise Unreadable(
+                    "malformed", f"mesh scan: start {message.start} rad, range cap {message.range_cap_m} m"
+                )
             _check_bounds("scan: stamp", _MAX_TIME_S, message.stamp)
         case Status():
             _check_pose(message.pose)
@@ -192,14 +242,16 @@ def _check(message: Message) -> None:
             _check_bounds("digest: stamp", _MAX_TIME_S, message.stamp)
         case Command():
             if message.action not in ACTIONS:
-                raise InputError(f"mesh command '{message.action}', expected one of {', '.join(ACTIONS)}")
+                raise Unreadable("malformed", f"mesh command '{message.action}', expected one of {', '.join(ACTIONS)}")
         case Tiles():
             pass  # each tile's cells are checked when they are unpacked
 
 
 def _check_bounds(what: str, most: float, *values: float) -> None:
     if not all(abs(value) <= most for value in values):  # nan is not, either
-        raise InputError(f"mesh {what} {', '.join(map(str, values))}, expected at most {most:g} either way")
+        raise Unreadable(
+            "malformed", f"mesh {what} {', '.join(map(str, values))}, expected at most {most:g} either way"
+        )
 
 
 def _check_pose(pose: Pose) -> None:

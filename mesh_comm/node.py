@@ -42,7 +42,7 @@ class MeshNode:
 
     All times are the caller's seconds and must not run backwards; nothing here reads a clock, waits, or draws random
     numbers, so the same calls give the same datagrams. `bytes_sent` counts sealed bytes by kind (scan, tile, digest,
-    status; commands count as status).
+    status; commands count as status), `newer` messages that were read and hold fields beyond those known here.
     """
 
     def __init__(
@@ -59,6 +59,7 @@ class MeshNode:
         self.id = sealer.own
         self.settings = settings
         self.bytes_sent = {"scan": 0, "tile": 0, "digest": 0, "status": 0}
+        self.newer = 0
         self._evidence = evidence
         self._lidar = lidar
         self._range_cap_m = range_cap_m
@@ -93,9 +94,11 @@ class MeshNode:
             return  # counted by the sealer
         try:
             message = messages.decode(opened.payload)
-        except InputError as error:
-            self._drop("malformed", opened.sender, error)
+        except messages.Unreadable as error:
+            self._drop(error.reason, opened.sender, error)
             return
+        if messages.newer_fields(opened.payload):
+            self.newer += 1
         try:
             self._take(message, opened, datagram, now)
         except InputError as error:

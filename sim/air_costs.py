@@ -10,16 +10,16 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from imagine.core.raster import TILE
-from imagine.mesh_comm.codec import RANGE_STEP_M
+from imagine.core.raster import LIMIT, RANGE_STEP_M, TILE
 from imagine.mesh_comm.messages import MAX_DATAGRAM
 from imagine.mesh_comm.seal import OVERHEAD
 
-SCAN_WEIGHTS = (13.40, 0.736, 0.734, 2.598)
+SCAN_WEIGHTS = (5.429, 0.414, 0.403, 0.631)
 """Bytes of a packed scan: in all, and per beam whose code differs from that before, by 8 or more, by 128 or more."""
-TILE_WEIGHTS = (29.87, 0.034, 0.653, 1.765)
-"""Bytes of a packed tile: in all, and per change along a row, per change that the row above has not, per new row."""
-VERSIONS_WEIGHTS = (23.52, 2.395)
+TILE_WEIGHTS = (3.789, 0.060, 0.551, 0.274, 0.194)
+"""Bytes of a packed tile: in all, per change along a row, per change that the row above has not, to a sure cell and to
+an unsure one, and per unsure cell."""
+VERSIONS_WEIGHTS = (-3.068, 1.947)
 """Bytes of a packed version list: in all, and per tile."""
 
 _SCAN_BYTES = OVERHEAD + 73  # wire version, array, tag, sender, stamp, pose, angles, beams, cap, length of the ranges
@@ -30,6 +30,7 @@ _HOLDING_BYTES = 6  # array, source, two bounds of no interval, length of the ve
 _STATUS_TEXT_BYTES = 8 + 6 + 9  # "OFFBOARD", "policy", "exploring": what a drone that explores has to tell
 _STATUS_BYTES = OVERHEAD + 112 + _STATUS_TEXT_BYTES
 _LINK_BYTES = 10  # id and seconds
+_LOWEST, _HIGHEST = np.int8(-LIMIT), np.int8(LIMIT)
 _STEPS_A_METRE = round(1.0 / RANGE_STEP_M)
 
 
@@ -78,41 +79,52 @@ def scan_features(ranges, range_min, range_cap):  # type: ignore[no-untyped-def]
 def tile_features(cells, row0, column0):  # type: ignore[no-untyped-def]
     """Count, in the tile of `cells` (int8 `[rows, columns]`) that starts at (row0, column0), what is hard to compress.
 
-    Changes along rows, those of them that the row above has not, and rows that differ from the row above.
+    Changes along rows; those of them that the row above has not, to cells without evidence or with evidence at its
+    limit, and to the others, which are unsure; and all unsure cells.
     """
-    changes, news, rows = np.int64(0), np.int64(0), np.int64(0)
+    changes, news, unsure_news, unsure = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for i in range(TILE):
         row = np.uintp(row0 + i)
         above = np.uintp(row0 + i - 1) if i > 0 else row
-        row_changes, row_news, differs = np.int8(0), np.int8(0), np.int8(0)
+        row_changes, row_news, row_unsure_news, row_unsure = np.int8(0), np.int8(0), np.int8(0), np.int8(0)
+        for j in range(TILE):
+            row_unsure = np.int8(row_unsure + _is_unsure(cells[row, np.uintp(column0 + j)]))
         for j in range(1, TILE):
             here, left = np.uintp(column0 + j), np.uintp(column0 + j - 1)
             value, before = cells[row, here], cells[row, left]
             value_above, before_above = cells[above, here], cells[above, left]
             changed = np.int8(value != before)
             other = np.int8(np.int8(value != value_above) | np.int8(before != before_above))
+            new = np.int8(changed & other) if i > 0 else changed
             row_changes = np.int8(row_changes + changed)
-            row_news = np.int8(row_news + np.int8(changed & other))
-            differs = np.int8(differs | other)
+            row_news = np.int8(row_news + new)
+            row_unsure_news = np.int8(row_unsure_news + np.int8(new & _is_unsure(value)))
         changes += np.int64(row_changes)
-        news += np.int64(row_news if i > 0 else row_changes)
-        rows += np.int64(differs)
-    return changes, news, rows
+        news += np.int64(row_news - row_unsure_news)
+        unsure_news += np.int64(row_unsure_news)
+        unsure += np.int64(row_unsure)
+    return changes, news, unsure_news, unsure
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_unsure(value):  # type: ignore[no-untyped-def]
+    return np.int8(value != 0) & np.int8(value != _LOWEST) & np.int8(value != _HIGHEST)
 
 
 @numba.njit(cache=True, nogil=True)
 def packed_tile_bytes(cells, row0, column0):  # type: ignore[no-untyped-def]
     """Estimate the bytes of `codec.pack_tile` for the tile of `cells` that starts at (row0, column0)."""
-    changes, news, rows = tile_features(cells, row0, column0)
-    base, per_change, per_new, per_row = TILE_WEIGHTS
-    return int(base + per_change * changes + per_new * news + per_row * rows + 0.5)
+    changes, news, unsure_news, unsure = tile_features(cells, row0, column0)
+    base, per_change, per_new, per_unsure_new, per_unsure = TILE_WEIGHTS
+    size = base + per_change * changes + per_new * news + per_unsure_new * unsure_news + per_unsure * unsure
+    return int(size + 0.5)
 
 
 @numba.njit(cache=True, nogil=True)
 def packed_versions_bytes(tiles):  # type: ignore[no-untyped-def]
     """Estimate the bytes of `codec.pack_versions` for so many tiles."""
     base, per_tile = VERSIONS_WEIGHTS
-    return int(base + per_tile * tiles + 0.5)
+    return max(1, int(base + per_tile * tiles + 0.5))
 
 
 @numba.njit(cache=True, nogil=True)

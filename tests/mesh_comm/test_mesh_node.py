@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from radio_room import CAP_M, KEY, LIDAR, Drone, carrying, contents, exchange, make_drone, room_scan, same_layers
 
 from imagine.core.errors import InputError
-from imagine.core.evidence import EvidenceMap
+from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import Pose
 from imagine.core.lidar import Scan
 from imagine.mesh_comm import messages
@@ -28,6 +29,11 @@ def ticks(start: float, seconds: float) -> np.ndarray:
 def snapshot(evidence: EvidenceMap) -> dict[int, tuple[bytes, bytes, bytes]]:
     layers = evidence.layers.items()
     return {s: (v.cells.tobytes(), v.versions.tobytes(), v.provisional.tobytes()) for s, v in layers}
+
+
+def own_tiles(evidence: EvidenceMap) -> dict[TileKey, bytes]:
+    """Return the cells of own tiles by their place: the grid around them may grow."""
+    return {key: evidence.tile(evidence.own, key).tobytes() for key in evidence.versions(evidence.own)}
 
 
 def wander(rng: np.random.Generator, drone: Drone, now: float) -> None:
@@ -425,8 +431,7 @@ def test_mutated_messages_never_raise_even_under_the_right_key(data: st.DataObje
     drone = _LISTENER
     drone.node.receive(_FORGER.seal(bytes(payload), 0.0), 0.0)
     drone.node.poll(0.0)
-    own = drone.evidence.layers[2]
-    assert own.cells.tobytes() == _OWN_CELLS
+    assert own_tiles(drone.evidence) == _OWN_TILES
     assert len(drone.evidence.layers) <= 4
     assert drone.evidence.belief().shape[0] <= 160 * 32
 
@@ -466,7 +471,7 @@ def payloads() -> list[bytes]:
 
 
 _LISTENER = listener()
-_OWN_CELLS = _LISTENER.evidence.layers[2].cells.tobytes()
+_OWN_TILES = own_tiles(_LISTENER.evidence)
 _PAYLOADS = payloads()
 _FORGER = Sealer(KEY, 1, 1)
 
@@ -487,8 +492,8 @@ def test_a_tile_far_outside_is_refused_and_memory_stays_bounded() -> None:
 @pytest.mark.parametrize(
     "tiles",
     [
-        Tiles(1, [Tile(0, 0, 1, b"no cells at all")]),
-        Tiles(2, [Tile(0, 0, 2**31, b"no cells at all")]),  # the listener's own
+        Tiles(1, [Tile(0, 0, 1, b"\xff" * 900)]),
+        Tiles(2, [Tile(0, 0, 2**31, b"\xff" * 900)]),  # the listener's own
         Tiles(1, [Tile(160, 0, 1, pack_tile(np.ones((32, 32), np.int8)))]),
         Tiles(200, [Tile(0, 0, 1, pack_tile(np.ones((32, 32), np.int8)))]),  # one source too many
     ],
@@ -505,6 +510,22 @@ def test_nothing_is_noted_of_tiles_that_are_refused(tiles: Tiles) -> None:
     assert drone.node.stats["content"] == 1
     assert record.holdings == before
     assert len(drone.node._exchange._sent) == noted
+
+
+def test_what_newer_nodes_say_is_counted_and_hurts_nothing() -> None:
+    drone = listener()
+    before = snapshot(drone.evidence)
+    order = messages.encode(messages.Command("land", 2, 3))
+    kind_6, version_3 = bytes((order[0],)) + b"\x92\x06\x01", b"\x03" + order[1:]
+    for payload in (kind_6, version_3, version_3):
+        drone.node.receive(_FORGER.seal(payload), 0.0)
+    assert drone.node.stats == {"kind": 1, "version": 2}
+    status = msgspec.msgpack.decode(messages.encode(Status(1, 0.0, Pose(0.5, 0.0, 0.0)))[1:])
+    drone.node.receive(_FORGER.seal(order[:1] + msgspec.msgpack.encode([*status, "news"])), 0.0)
+    assert drone.node.newer == 1
+    assert drone.node.peers(0.0)[1].is_live
+    assert sum(drone.node.stats.values()) == 3
+    assert snapshot(drone.evidence) == before
 
 
 def test_a_node_in_anothers_name_is_refused() -> None:
