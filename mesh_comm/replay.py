@@ -20,6 +20,11 @@ class ReplayWindow:
     highest: int = -1
     seen: int = 0
 
+    @classmethod
+    def since(cls, boot: int, counter: int) -> ReplayWindow:
+        """Return the window of a life first heard by `counter`: what came before that may be a recording."""
+        return cls(boot, counter - 1, _ALL)
+
     def is_fresh(self, counter: int) -> bool:
         """Tell whether a counter is new; what is too far behind to be remembered is not."""
         behind = self.highest - counter

@@ -70,7 +70,8 @@ class Sealer:
 
     `boot` (u32) must grow at every start of the node (`keys.next_boot_number`): it keeps nonces unique, and lets the
     others accept a restarted node while they still refuse recordings of its earlier life. Times `now` are the caller's
-    seconds, of any origin; they matter only to keys with times.
+    seconds, of any origin; they matter only to keys with times. A key that is heard before it sends by this node's time
+    shows that its clock is behind: from then on it is at least that key's `sends_from`.
     """
 
     def __init__(
@@ -185,8 +186,10 @@ class Sealer:
             self._namesake.hear(boot, payload if flags & _CLAIM else None, now)
             raise Rejected("own-id", f"mesh datagram under the own id {sender}, of another life or another node")
         if window is None or boot > window.boot:
-            window = self._windows[sender] = ReplayWindow(boot)
+            window = self._windows[sender] = ReplayWindow.since(boot, counter)
         window.mark(counter)
+        if now < timed.sends_from:  # somebody's clock says that this key's time has come, and no clock runs early
+            self._set_forward(timed.sends_from - now)
         if flags & _CLAIM:
             raise Rejected("claim", f"mesh node {sender} tells another one that they share an id")
         return Opened(sender, boot, counter, payload)
@@ -217,6 +220,13 @@ class Sealer:
                 timed = _Timed(key, now + (key.sends_from - unix_time_s), now + (key.accepted_until - unix_time_s))
             self._keys[key.id] = timed
         return self._keys
+
+    def _set_forward(self, seconds: float) -> None:
+        """Take it to be so much later than the clock said at the start."""
+        self._keys = {
+            id_: _Timed(timed.key, timed.sends_from - seconds, timed.accepted_until - seconds)
+            for id_, timed in self._keys.items()
+        }
 
     def _cipher(self, key_id: int, sender: int) -> ChaCha20Poly1305:
         cipher = self._ciphers.get((key_id, sender))

@@ -64,7 +64,7 @@ def samples() -> list[tuple[int, Message]]:
 
 def vectors() -> dict[str, Any]:
     """Return what the file holds: keys, and each datagram with its payload and contents; bytes in hexadecimal."""
-    sealers = {sender: Sealer(KEY, sender, BOOT) for sender in (SENDER, GROUND)}
+    sealers = {sender: Sealer(KEY, sender, BOOT, first_counter=1) for sender in (SENDER, GROUND)}
     listed = []
     for sender, message in samples():
         payload = messages.encode(message)
@@ -72,7 +72,7 @@ def vectors() -> dict[str, Any]:
             {
                 "kind": type(message).__name__,
                 "sender": sender,
-                "datagram": sealers[sender].seal(payload).hex(),
+                "datagram": sealers[sender].seal(payload, 0.0).hex(),
                 "payload": payload.hex(),
                 "content": content(message),
             }

@@ -52,8 +52,7 @@ def fly(here: str, there: str) -> dict[int, dict[str, Any]]:
     """Run drone 1 with the links `here` and drone 2, in the other namespace, with those of `there`."""
     done = _unshared(_SCRIPT, PYTHON=sys.executable, NODE=str(_NODE), HERE=here, THERE=there)
     assert done.returncode == 0, done.stderr
-    told = [json.loads(line) for line in done.stdout.splitlines()]
-    return {1 if record["peers"] == [2] else 2: record for record in told}
+    return {record["id"]: record for record in map(json.loads, done.stdout.splitlines())}
 
 
 @pytest.mark.parametrize(
@@ -69,8 +68,9 @@ def fly(here: str, there: str) -> dict[int, dict[str, Any]]:
 )
 def test_two_drones_share_their_maps_over_a_cable(url: str) -> None:
     told = fly(url, url)
-    assert told[1]["peers"] == [2]
-    assert told[2]["peers"] == [1]
+    assert [set(told[own]["tiles"]) for own in (1, 2)] == [{"2"}, {"1"}]
+    assert told[1]["tiles"]["2"] > 0
+    assert told[2]["tiles"]["1"] > 0
     assert set(told[1]["stats"]) | set(told[2]["stats"]) <= {"echo"}
 
 

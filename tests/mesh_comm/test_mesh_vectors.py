@@ -28,7 +28,7 @@ def test_every_kind_is_there() -> None:
 def test_a_datagram_is_opened_read_and_written_again(row: dict[str, Any]) -> None:
     datagram = bytes.fromhex(row["datagram"])
     assert len(datagram) <= messages.MAX_DATAGRAM
-    opened = Sealer(bytes.fromhex(LISTED["key"]), 254, 1).open(datagram)
+    opened = Sealer(bytes.fromhex(LISTED["key"]), 254, 1).open(datagram, 0.0)
     assert (opened.sender, opened.boot, opened.payload.hex()) == (row["sender"], LISTED["boot"], row["payload"])
     message = messages.decode(opened.payload)
     assert type(message).__name__ == row["kind"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 
 import numpy as np
 import pytest
@@ -62,7 +63,7 @@ def test_noise_is_refused_and_counted(noise: bytes) -> None:
 def test_each_datagram_opens_once_in_any_order_however_often_it_comes(data: st.DataObject) -> None:
     a, b = pair()
     datagrams = [a.seal(bytes((i,)), 0.0) for i in range(40)]
-    heard = data.draw(st.lists(st.integers(0, 39), max_size=120))
+    heard = [0, *data.draw(st.lists(st.integers(0, 39), max_size=120))]
     opened = []
     for index in heard:
         with contextlib.suppress(Rejected):
@@ -73,10 +74,23 @@ def test_each_datagram_opens_once_in_any_order_however_often_it_comes(data: st.D
 
 def test_what_falls_behind_the_window_is_refused() -> None:
     a, b = pair()
-    datagrams = [a.seal(b"", 0.0) for _ in range(WINDOW + 1)]
+    first, *datagrams = [a.seal(b"", 0.0) for _ in range(WINDOW + 2)]
+    b.open(first, 0.0)
     b.open(datagrams[WINDOW], 0.0)
     b.open(datagrams[1], 0.0)
     assert refusal(b, datagrams[0]) == "replay"
+
+
+@given(st.integers(0, 29), st.permutations(range(30)))
+def test_nothing_said_before_a_sender_was_first_heard_is_taken_after_that(first: int, order: list[int]) -> None:
+    a, b = pair()
+    datagrams = [a.seal(bytes((i,)), 0.0) for i in range(30)]
+    b.open(datagrams[first], 0.0)
+    for index in order:
+        if index <= first:
+            assert refusal(b, datagrams[index]) == "replay"
+        else:
+            assert b.open(datagrams[index], 0.0).payload == bytes((index,))
 
 
 def test_a_restarted_sender_is_heard_and_its_past_is_not() -> None:
@@ -137,11 +151,11 @@ BOTH = KeyRing((OLD, NEW))
 
 def test_the_new_key_sends_from_its_time_and_the_old_one_opens_until_its_end() -> None:
     a, b, behind = Sealer(BOTH, 1, 1, unix_time_s=900.0), Sealer(BOTH, 2, 1, unix_time_s=900.0), Sealer(KEY, 3, 1)
-    assert a.seal(b"", 0.0)[3] == OLD.id
-    assert a.seal(b"", 99.9)[3] == OLD.id
+    first = a.seal(b"", 0.0)
+    assert first[3] == a.seal(b"", 99.9)[3] == OLD.id
     later = a.seal(b"new", 100.0)
     assert later[3] == NEW.id
-    assert b.open(a.seal(b"", 0.0), 0.0).sender == 1  # b's time begins with its first call
+    assert b.open(first, 0.0).sender == 1  # b's time begins with its first call
     assert b.open(later, 100.0).payload == b"new"
     assert b.open(behind.seal(b"old", 0.0), 1099.9).payload == b"old"
     assert refusal(b, behind.seal(b"old", 0.0), 1100.0) == "expired-key"
@@ -159,6 +173,34 @@ def test_drones_whose_clocks_differ_by_hours_hear_each_other_all_through_the_ove
     for at in np.arange(0.0, 1.9 * day, 3600.0).tolist():
         assert b.open(a.seal(b"", origin_a + at), origin_b + at).sender == 1
         assert a.open(b.seal(b"", origin_b + at), origin_a + at).sender == 2
+
+
+@given(st.tuples(*[st.floats(-3e6, 3e6)] * 3))
+def test_drones_with_one_file_hear_each_other_whatever_their_clocks_say(errors_s: tuple[float, ...]) -> None:
+    ring = KeyRing.of(KEY)
+    for number in range(1, 4):  # changed every ten days
+        secret = bytes((number,)) * 32
+        ring = ring.rotated(lambda made=secret: made, 864e3 * number, after_s=86400.0, overlap_s=86400.0)
+    drones = [Sealer(ring, own, 1, unix_time_s=1e6 + error) for own, error in enumerate(errors_s, 1)]
+    for tick in range(4):
+        for a, b in itertools.permutations(drones, 2):
+            with contextlib.suppress(Rejected):
+                b.open(a.seal(b"", float(tick)), float(tick))
+    for a, b in itertools.permutations(drones, 2):
+        assert b.open(a.seal(b"x", 5.0), 5.0).payload == b"x"
+
+
+def test_a_key_in_use_before_its_time_sets_the_clock_forward_and_ends_the_old_one_in_time() -> None:
+    behind, right = Sealer(BOTH, 1, 1, unix_time_s=0.0), Sealer(BOTH, 2, 1, unix_time_s=1700.0)  # it is 500 at least
+    stolen = Sealer(KEY, 3, 1)
+    forged = bytearray(right.seal(b"", 0.0))
+    forged[-1] ^= 1
+    assert refusal(behind, bytes(forged)) == "forged"
+    assert behind.seal(b"", 0.0)[3] == OLD.id  # only what is true counts
+    behind.open(right.seal(b"", 0.0), 0.0)
+    assert behind.seal(b"", 0.0)[3] == NEW.id
+    assert behind.open(stolen.seal(b"", 999.0), 999.0).sender == 3
+    assert refusal(behind, stolen.seal(b"", 1000.0), 1000.0) == "expired-key"
 
 
 def test_a_clock_that_stands_at_1970_keeps_no_old_key_alive_for_ever() -> None:

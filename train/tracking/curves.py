@@ -48,6 +48,9 @@ def plot_run(run_folder: Path, png: Path) -> None:
     _draw(coverage, x, {level: curves[f"episode/{level}/coverage"] for level in levels}, smooth=False)
     _finish(coverage, "coverage by level", legend=True)
     _draw(t90, x, {level: curves[f"episode/{level}/t90"] for level in levels}, smooth=False)
+    middles = [np.nanmedian(curves[f"episode/{level}/t90"]) for level in levels]
+    if levels and np.isfinite(middles).any():
+        t90.set_ylim(0.0, 1.4 * np.nanmax(middles))  # whoever has just begun is far above, and hides what comes of it
     _finish(t90, "ticks to 90 % by level", legend=False)
     _draw(losses, x, _named(curves, {"imitation/loss": "imitation", "ppo/value_loss": "value"}))
     _positive_log(losses)
@@ -158,7 +161,7 @@ def _finish(axes: Axes, title: str, legend: bool = True, also: Axes | None = Non
         handles, labels = handles + more_handles, labels + more_labels
     if not handles:
         axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", color="#999999")
-    elif legend and sum(len(label) + 5 for label in labels) < _TITLE_ROOM - len(title):
+    elif legend and sum(len(label) + 8 for label in labels) < _TITLE_ROOM - len(title):
         axes.legend(  # beside the title, where it hides nothing
             handles, labels, frameon=False, fontsize=8, ncols=len(handles), loc="lower right",
             bbox_to_anchor=(1.02, 0.985), borderpad=0.1, handlelength=1.2, columnspacing=1.0, handletextpad=0.4,
