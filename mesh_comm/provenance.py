@@ -94,6 +94,10 @@ class Provenance:
         arrival = self._arrival(source, key)
         arrival.version, arrival.via, arrival.tile_at = version, via, now
 
+    def forget(self, source: int) -> None:
+        """Drop what is noted of a source, whose layer was dropped."""
+        self._arrivals.pop(source, None)
+
     def at(self, x: float, y: float) -> CellProvenance:
         """Return where the belief in the cell at (x, y), metres of the own frame, comes from; nothing off the map."""
         column, row = math.floor(x / CELL), math.floor(y / CELL)

@@ -23,12 +23,13 @@ VERSIONS_WEIGHTS = (-3.068, 1.947)
 """Bytes of a packed version list: in all, and per tile."""
 
 _SCAN_BYTES = OVERHEAD + 73  # wire version, array, tag, sender, stamp, pose, angles, beams, cap, length of the ranges
-_TILES_BYTES = OVERHEAD + 5  # wire version, array, tag, source, length of the list
+_TILES_BYTES = OVERHEAD + 10  # wire version, array, tag, source, length of the list, boot number
 _TILE_BYTES = 5  # array, column, row, length of the cells
 _DIGEST_BYTES = OVERHEAD + 13  # wire version, array, tag, stamp, length of the list
-_HOLDING_BYTES = 6  # array, source, two bounds of no interval, length of the versions
+_HOLDING_BYTES = 11  # array, source, two bounds of no interval, length of the versions, boot number
 _STATUS_TEXT_BYTES = 8 + 6 + 9  # "OFFBOARD", "policy", "exploring": what a drone that explores has to tell
-_STATUS_BYTES = OVERHEAD + 112 + _STATUS_TEXT_BYTES
+_TAUGHT_BYTES = 11 + 2 * 3  # the names scan and tile, and cells of each, up to 65535
+_STATUS_BYTES = OVERHEAD + 112 + _STATUS_TEXT_BYTES + _TAUGHT_BYTES
 _LINK_BYTES = 10  # id and seconds
 _LOWEST, _HIGHEST = np.int8(-LIMIT), np.int8(LIMIT)
 _STEPS_A_METRE = round(1.0 / RANGE_STEP_M)
