@@ -50,6 +50,18 @@ def tile_news(cells, row0, column0, peer_cells):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def known_cells(cells, row0, column0):  # type: ignore[no-untyped-def]
+    """Return how many cells of the tile that starts at (row0, column0) have evidence."""
+    known = np.int64(0)
+    for i in range(TILE):
+        row_known = np.int8(0)
+        for j in range(TILE):
+            row_known = np.int8(row_known + np.int8(cells[np.uintp(row0 + i), np.uintp(column0 + j)] != 0))
+        known += np.int64(row_known)
+    return known
+
+
+@numba.njit(cache=True, nogil=True)
 def unsent_share(fresh, edge, known, known_when_sent):  # type: ignore[no-untyped-def]
     """Return (cells, worth): what a tile tells of `tile_news` to a peer that holds it as it was when last sent.
 

@@ -12,7 +12,7 @@ from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import IDENTITY
 from imagine.core.raster import TILE
 from imagine.mesh_comm.codec import pack_tile
-from imagine.mesh_comm.information import TYPICAL_TILE_BYTES, density, tile_news, unsent_share
+from imagine.mesh_comm.information import TYPICAL_TILE_BYTES, density, known_cells, tile_news, unsent_share
 from imagine.mesh_comm.messages import GROUND, Tile, Tiles, tile_key
 from imagine.mesh_comm.peers import PeerRecord
 from imagine.mesh_comm.receipts import Receipts
@@ -208,7 +208,7 @@ class TileExchange:
         return int(told), int(worth), int(known)
 
     def _known(self, source: int, key: TileKey) -> int:
-        return int(np.count_nonzero(self._evidence.tile(source, key)))
+        return int(known_cells(self._evidence.tile(source, key), 0, 0))
 
     def _packed_bytes(self, source: int, key: TileKey) -> int:
         """Return how long a tile was when it was packed last."""

@@ -5,17 +5,21 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from imagine.core.raster import TILE
+from imagine.mesh_comm.information import MOST_DENSITY, TYPICAL_TILE_BYTES, density, tile_news, unsent_share
 from imagine.sim.air import MOST_WANTED, NEVER
 
 _DIGEST_GRACE_S = 0.25  # as in mesh_comm.tile_exchange
 _ROWS, _PLACES, _SOURCES, _STALE, _MISSING = 1 << 12, 1 << 24, 1 << 6, 1 << 24, 1 << 6  # digits of a queue entry
+_NEWS = MOST_DENSITY + 1  # ranks below are of tiles that tell something new
 
 
 @numba.njit(cache=True, nogil=True)
-def plan(air, world, tick, drone, live, versions):  # type: ignore[no-untyped-def]
-    """Queue the tiles that some peer in touch, by its last digest, lacks: most lacking first, then most outdated.
+def plan(air, world, tick, drone, live, layers, versions):  # type: ignore[no-untyped-def]
+    """Queue the tiles that some peer in touch, by its last digest, lacks.
 
-    The queue is `air.wanted` up to `wanted` of the drone's node; an entry is its rank and place in one number, least
+    Those come first that tell most new cells a byte, then those that only confirm: most lacking first, then most
+    outdated. The queue is `air.wanted` up to `wanted` of the drone's node; an entry is its rank and place in one number, least
     first. `live` has a bit for each peer in touch.
     """
     rules, node, peers = air.rules, air.nodes[world, drone], air.peers[world, drone]
@@ -40,7 +44,7 @@ def plan(air, world, tick, drone, live, versions):  # type: ignore[no-untyped-de
             sent_at = note.sent_tick / rate
             if was_sent and now - sent_at < rules.tile_period:
                 continue
-            missing, stale = np.int64(0), np.int64(0)
+            missing, stale, worth = np.int64(0), np.int64(0), np.int64(0)
             for peer in range(drones):
                 has = np.int64(holdings[peer, source, tile])
                 if has >= version or (readers >> peer) & 1 == 0 or peer == source:
@@ -53,8 +57,17 @@ def plan(air, world, tick, drone, live, versions):  # type: ignore[no-untyped-de
                     continue  # the source sends this peer its newest tiles itself
                 missing += np.int64(has == 0)
                 stale += version - has
+                if source != drone or has < np.int64(air.met[world, drone, peer, tile]):
+                    fresh, edge, known = tile_news(
+                        layers[drone, source], row * TILE, column * TILE, layers[drone, peer]
+                    )  # fmt: skip
+                    worth += unsent_share(fresh, edge, known, np.int64(note.sent_known) if has > 0 else 0)[1]
             if stale > 0:
-                rank = (_MISSING - 1 - missing) * _STALE + _STALE - 1 - min(stale, np.int64(_STALE - 1))
+                if worth > 0:
+                    size = np.int64(note.cost) if note.cost_version > 0 else TYPICAL_TILE_BYTES
+                    rank = MOST_DENSITY - density(worth, size)
+                else:
+                    rank = (_MISSING - 1 - missing) * _STALE + _STALE - 1 - min(stale, np.int64(_STALE - 1)) + _NEWS
                 place = column * _ROWS + row  # ties in the order of tile keys
                 wanted[node.wanted] = ((rank * 2 + (source != drone)) * _SOURCES + source) * _PLACES + place
                 node.wanted += 1
@@ -76,6 +89,12 @@ def _sort(values, count):  # type: ignore[no-untyped-def]
                 j -= gap
             values[j] = value
         gap //= 3
+
+
+@numba.njit(cache=True, nogil=True)
+def brings_news(entry):  # type: ignore[no-untyped-def]
+    """Tell whether the tile of a queue entry tells some peer a cell that it does not know."""
+    return entry // (_PLACES * _SOURCES * 2) < _NEWS
 
 
 @numba.njit(cache=True, nogil=True)

@@ -123,7 +123,7 @@ def test_a_tile_is_always_what_its_source_had_at_that_version(
         return cells[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
 
     def check() -> None:
-        state.nodes[0]["tiles_first"] |= tiles_first  # as after a tick that was short of bytes: scans follow tiles
+        state.nodes[0]["scans_ahead"] += 4 * tiles_first  # as after ticks that were short of bytes: scans follow tiles
         for source in range(3):
             for row, column in np.argwhere(chain.versions[source, source] == chain.clocks[source]):
                 key = (source, row, column, int(chain.clocks[source]))
