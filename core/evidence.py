@@ -188,7 +188,7 @@ class EvidenceMap:
             raise InputError(f"a tile of source {source} came from outside, but only drone {source} writes it")
         if cells.shape != (TILE, TILE) or cells.dtype != np.int8:
             raise InputError(f"a tile is int8 {TILE}x{TILE}, got {cells.dtype} {cells.shape}")
-        if not 1 <= version < 2**32 or np.abs(cells.astype(np.int16)).max() > LIMIT:
+        if not 1 <= version < 2**32 or cells.max() > LIMIT or cells.min() < -LIMIT:
             raise InputError(f"tile {tuple(key)} of source {source}: version {version} or its cells are out of range")
         self._cover_tiles(key.column, key.row, key.column, key.row)
         layer = self.layer(source)

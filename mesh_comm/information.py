@@ -14,6 +14,10 @@ FRONTIER_WORTH = 4
 """A free cell beside unknown ones is worth so many cells more: it tells where to go on, or that nobody need."""
 TYPICAL_TILE_BYTES = 80
 """A packed tile of a flight, where its own size is not known yet."""
+SCAN_NEWS_CELLS = 8
+"""A scan goes out once it shows so many cells that no scan before it told of: fewer are not worth its bytes."""
+SCAN_REST_S = 1.0
+"""After so long a scan goes out that only changes what is known."""
 _SCALE = 64
 MOST_DENSITY = 2**20 - 1
 """No tile ranks higher: all cells of a tile at the frontier, new to 31 peers, for 20 bytes."""

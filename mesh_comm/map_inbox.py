@@ -30,11 +30,13 @@ class MapInbox:
         self._settings = settings
         self._known = KnownCells(evidence)
         self._provenance = Provenance(evidence)
+        self._own_counted = 0  # the own clock up to which own cells are counted
 
     def note_own(self, pose: Pose, range_cap_m: float, stamp: float, now: float) -> None:
         """Note that an own scan of this stamp, taken at `pose`, was mapped, and count what own scans made known."""
         self._provenance.note_own(stamp, now)
         self._count_own(pose, range_cap_m)
+        self._own_counted = self._own_clock
 
     def renew(self, source: int, boot: int) -> bool:
         """Tell whether what a source's start number `boot` says counts; what is held of earlier starts is dropped.
@@ -57,7 +59,7 @@ class MapInbox:
             return
         frame = self._evidence.placement(scan.sender)
         where = None if frame is None else scan.pose if frame == IDENTITY else compose(frame, scan.pose)
-        if where is not None:
+        if where is not None and self._own_counted != self._own_clock:
             self._count_own(where, scan.range_cap_m)
         draw_peer_scan(self._evidence, scan, teammates, self._settings.mask_radius_m)
         reach_m = scan.range_cap_m + 2 * CELL
@@ -78,7 +80,8 @@ class MapInbox:
             key = tile_key(tile)
             if is_source_near and self._evidence.is_provisional(message.source, key):
                 continue
-            self.own_cells += self._known.claim_tile(message.source, key)
+            if self._own_counted != self._own_clock:
+                self.own_cells += self._known.claim_tile(message.source, key)
             if self._exchange.merge(message.source, tile, cells):
                 self._provenance.note_tile(message.source, key, tile.version, via, now)
                 self.map_cells += self._known.claim_tile(message.source, key)
@@ -90,6 +93,10 @@ class MapInbox:
     def provenance(self, x: float, y: float) -> CellProvenance:
         """Return where the belief in the cell at (x, y), metres of the own frame, comes from."""
         return self._provenance.at(x, y)
+
+    @property
+    def _own_clock(self) -> int:
+        return self._evidence.layers[self._evidence.own].clock
 
     def _count_own(self, pose: Pose, range_cap_m: float) -> None:
         """Count the cells that own scans have made known within a scan's reach of `pose`, own frame."""

@@ -17,6 +17,7 @@ from imagine.mesh_comm import messages
 from imagine.mesh_comm.budget import TokenBucket
 from imagine.mesh_comm.codec import unpack_tile
 from imagine.mesh_comm.digest import Held, digests
+from imagine.mesh_comm.information import SCAN_NEWS_CELLS, SCAN_REST_S
 from imagine.mesh_comm.map_inbox import MapInbox
 from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Command, Digest, Message, Status, Tiles, tile_key
 from imagine.mesh_comm.orders import Orders
@@ -88,7 +89,7 @@ class MeshNode:
         self._digest_turn = 0
         self._digest_at, self._digest_bytes = -np.inf, 0
         self._next_status = self._next_digest = self._next_scan = self._next_plan = -np.inf
-        self._scan_since = -np.inf
+        self._scan_since = self._scan_sent_at = -np.inf
         self._scans_ahead = 0
         self._cells_told = 0
 
@@ -188,7 +189,8 @@ class MeshNode:
     def offer_scan(self, scan: Scan, pose: Pose, now: float) -> None:
         """Offer the node's own scan, taken at `pose`, for sending; call it after the scan was integrated into the map.
 
-        A scan that changed nothing, or that nobody is near to hear, is not sent. A newer scan replaces a waiting one.
+        A scan that changed nothing, or that nobody is near to hear, is not sent; nor, by the scheduler `information`,
+        one that shows hardly anything new within a second of the last. A newer scan replaces a waiting one.
         """
         if self.id == GROUND:
             raise InputError("the ground station has no scans to offer")
@@ -197,11 +199,19 @@ class MeshNode:
         clock = self._evidence.layers[self.id].clock
         if now < self._next_scan - _EPSILON_S or clock == self._scan_clock or not self._peers.map_listeners(now):
             return
+        if self._scan is None and not self._is_worth_telling(now):
+            return
         masked = mask_near(scan.ranges, self._lidar, pose, self.teammates(now), self.settings.mask_radius_m)
         offered = Scan(scan.stamp, masked)
         if self._scan is None:
             self._scan_since = now
         self._scan = scan_message(self.id, clock, pose, offered, self._lidar, self._range_cap_m, self._max_payload)
+
+    def _is_worth_telling(self, now: float) -> bool:
+        """Tell whether what own scans have made known since the last one that was sent is worth another."""
+        if self.settings.scheduler == "fifo" or self._maps.own_cells - self._cells_told >= SCAN_NEWS_CELLS:
+            return True
+        return now >= self._scan_sent_at + SCAN_REST_S - _EPSILON_S
 
     def set_status(self, status: Status) -> None:
         """Set what the next status message tells; cells, bytes, links, rejections and command are filled in."""
@@ -396,7 +406,7 @@ class MeshNode:
         self._cells_told = self._maps.own_cells
         self._scan_clock = self._scan.clock
         self._scan = None
-        self._next_scan = now + self.settings.scan_period_s
+        self._scan_sent_at, self._next_scan = now, now + self.settings.scan_period_s
         return True
 
     def _send_tiles(self, out: list[bytes], now: float) -> bool:

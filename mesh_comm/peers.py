@@ -77,8 +77,10 @@ class PeerRecord:
             known = self.holdings.get(holding.source)
             if known is None or known.boot != holding.boot:
                 known = Held(holding.boot, {})  # its layer of an earlier start is gone
-            kept = {key: version for key, version in known.versions.items() if not _covers(holding, key)}
-            self.holdings[holding.source] = Held(holding.boot, kept | versions)
+            if holding.after is not None or holding.until is not None:
+                kept = {key: version for key, version in known.versions.items() if not _covers(holding, key)}
+                versions = kept | versions
+            self.holdings[holding.source] = Held(holding.boot, versions)
         self.digest_stamp, self.digest_at = digest.stamp, now
 
     def note_held(self, source: int, boot: int, versions: Mapping[TileKey, int]) -> None:
@@ -114,6 +116,8 @@ class PeerRecord:
 
 def _versions(holding: Holding) -> dict[TileKey, int]:
     versions = unpack_versions(holding.packed)
+    if holding.after is None and holding.until is None:
+        return versions
     if not all(_covers(holding, key) for key in versions):
         raise InputError(f"mesh digest of source {holding.source} lists tiles outside its own interval")
     return versions

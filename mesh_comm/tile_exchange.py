@@ -22,6 +22,7 @@ _TILE_BYTES = 16  # a tile beside its packed cells: place, version and lengths, 
 _TILES_BYTES = 15
 _MOST_WANTED = 512
 _DIGEST_GRACE_S = 0.25  # a digest this soon after a tile was sent may have been written before the tile came
+_EPSILON_S = 1e-6
 _NOTHING = np.zeros((0, 0), np.int8)
 
 
@@ -48,12 +49,13 @@ class Wanted(NamedTuple):
     key: TileKey
     since: float
     told: dict[int, int]
+    worth: int
     known: int
 
     @property
     def brings_news(self) -> bool:
         """Whether it tells some peer a cell that it does not know, as far as is known here."""
-        return any(self.told.values())
+        return self.worth > 0
 
 
 class TileExchange:
@@ -69,6 +71,7 @@ class TileExchange:
         self._sent: dict[tuple[int, TileKey], _Sent] = {}
         self._since: dict[tuple[int, TileKey], float] = {}
         self._queue: list[Wanted] = []
+        self._next_repeats = -np.inf
 
     @property
     def head(self) -> Wanted | None:
@@ -104,13 +107,18 @@ class TileExchange:
         """Make the queue anew: tiles that some of `peers`, by their digests, lack and that may be sent at `now`.
 
         By `information` those come first that tell most new cells a byte, with more for cells at a frontier; then those
-        that only confirm what scans have told, lacking before outdated ones. By `fifo` the longest wanted come first.
+        that only confirm what scans have told, lacking before outdated ones; they are gathered for a period, so that a
+        datagram carries many. By `fifo` the longest wanted come first.
         """
+        repeats = now >= self._next_repeats - _EPSILON_S or self._settings.scheduler == "fifo"
+        if repeats:
+            self._next_repeats = now + self._settings.tile_period_s
+        repeats = repeats or any(not tile.brings_news for tile in self._queue)
         wanted: list[Wanted] = []
         by_id = {peer.id: peer for peer in peers}
         for source, key, version in self._available():
             last = self._sent.get((source, key))
-            if last is not None and now - last.at < self._settings.tile_period_s:
+            if last is not None and now - last.at < self._settings.tile_period_s - _EPSILON_S:
                 continue
             missing = stale = 0
             lacking: list[tuple[PeerRecord, int]] = []
@@ -129,6 +137,8 @@ class TileExchange:
             if stale:
                 wanted.append(self._ranked(source, key, missing, stale, lacking, now))
         self._since = {(tile.source, tile.key): tile.since for tile in wanted}
+        if not repeats:
+            wanted = [tile for tile in wanted if tile.worth > 0]
         wanted.sort(key=lambda tile: (tile.rank, tile.source, tile.key))
         self._queue = wanted[:_MOST_WANTED]
 
@@ -185,7 +195,7 @@ class TileExchange:
             rank = (0, -int(density(worth, self._packed_bytes(source, key))), is_relay)
         else:
             rank = (1, -missing, -stale, is_relay)
-        return Wanted(rank, source, key, since, told, known or self._known(source, key))
+        return Wanted(rank, source, key, since, told, worth, known or self._known(source, key))
 
     def _news(self, source: int, key: TileKey, peer: PeerRecord, held: int) -> tuple[int, int, int]:
         """Return (cells, worth, known): what a tile would tell a peer that holds version `held`, and what it knows.

@@ -50,12 +50,13 @@ NODE = _record(
     scan_clock=_INT, pending_clock=_INT, pending_bytes=_INT, pending_slot=_INT, canvas=_INT, sequence=_INT,
     dropped=_INT, wanted=_INT, digest_unit=_INT, digest_units=_INT, digest_parts=_INT,
     first_message=_INT, messages=_INT, busy_slots=_INT, scans=_INT,
-    first_tile=_INT, tiles=_INT, first_digest=_INT, digests=_INT, scans_ahead=_INT,
+    first_tile=_INT, tiles=_INT, first_digest=_INT, digests=_INT, scans_ahead=_INT, claimed_clock=_INT, told_cells=_INT, next_repeats=_FLOAT,
     digest_at=_FLOAT, digest_bytes=_INT,
 )  # fmt: skip
 """What a drone's mesh node keeps: `tokens` bytes left to send, `busy_until` and `next_...` seconds, `pending_...` of a
 scan that waits to be sent (clock 0 for none); `canvas` the slot of scans that the next one is drawn in; `busy_slots` a
-bit for each slot in flight; `wanted` tiles are queued; `scans_ahead` scans went out while they waited; the last digest
+bit for each slot in flight; `wanted` tiles are queued; `scans_ahead` scans went out while they waited; own cells are
+counted up to `claimed_clock`, and `told_cells` of them were by the last scan sent; the last digest
 was begun at `digest_at` and took `digest_bytes`; rings have a first and a count. `dropped` messages found the
 radio's queue full."""
 PEER = _record(
@@ -194,7 +195,7 @@ class Air:
         nodes["digest_at"] = -np.inf
         nodes["canvas"] = nodes["pending_slot"] = -1
         nodes["tokens"] = self.rules.burst
-        for name in ("next_status", "next_digest", "next_scan", "next_plan"):
+        for name in ("next_status", "next_digest", "next_scan", "next_plan", "next_repeats"):
             nodes[name] = -np.inf
 
     @property

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from imagine.core.raster import TILE
-from imagine.mesh_comm.information import known_cells
+from imagine.mesh_comm.information import SCAN_NEWS_CELLS, SCAN_REST_S, known_cells
 from imagine.mesh_comm.messages import MAX_DATAGRAM
 from imagine.mesh_comm.seal import OVERHEAD
 from imagine.sim.air import (
@@ -18,6 +18,7 @@ from imagine.sim.air import (
     BYTES_SENT,
     DIGEST,
     MESSAGES_SENT,
+    OWN_SCAN,
     SCAN,
     STATUS,
     TILES,
@@ -35,7 +36,7 @@ from imagine.sim.air_costs import (
 )
 from imagine.sim.air_plan import brings_news, plan, source_and_tile
 from imagine.sim.air_receive import is_live
-from imagine.sim.air_tiles import copy_tile, find_spans
+from imagine.sim.air_tiles import claim, copy_tile, find_spans
 
 # these are those of mesh_comm.node, tile_exchange and digest
 _PLAN_PERIOD_S = 0.2
@@ -95,7 +96,11 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
                 live |= 1 << peer
         shares = live != 0 and rules.shares
         can_offer = node.canvas >= 0 and now >= node.next_scan - _EPSILON_S and node.scans < air.windows.shape[2] - 1
-        if shares and can_offer and np.int64(clocks[drone]) != node.scan_clock:
+        changed = shares and can_offer and np.int64(clocks[drone]) != node.scan_clock
+        if changed and _is_worth_telling(
+            node, now, rules, clocks[drone], layers[drone, drone], versions[drone, drone], air.known[world, drone],
+            counters[drone],
+        ):
             # it replaces one that still waits; a slot stays free for the next canvas
             node.pending_slot, node.pending_clock = node.canvas, np.int64(clocks[drone])
             packed = packed_ranges_bytes(ranges[drone], rules.range_min, rules.range_cap)
@@ -112,9 +117,7 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
             node.digest_at, node.digest_bytes = now, 0
         if now >= node.next_plan - _EPSILON_S:
             node.next_plan = now + _PLAN_PERIOD_S
-            node.wanted = 0
-            if shares:
-                plan(air, world, tick, drone, live, layers, versions)
+            plan(air, world, tick, drone, live if rules.shares else 0, layers, versions)
         if now >= node.next_status - _EPSILON_S:
             said = _send_status(
                 rules, now, node, messages[drone], counters[drone], peers[drone], poses[drone], velocity[drone], live
@@ -139,6 +142,22 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
                 node.scans_ahead = node.scans_ahead + 1 if node.wanted > 0 else 0
             else:
                 break
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_worth_telling(node, now, rules, clock, cells, versions, known, counters):  # type: ignore[no-untyped-def]
+    """Tell whether a scan shows enough that is new, or is long after the last, or stands for one that waits.
+
+    Counts the cells that own scans have made known by now: `cells` and `versions` are the own layer's.
+    """
+    for i in range(versions.shape[0]):
+        for j in range(versions.shape[1]):
+            if np.int64(versions[i, j]) > node.claimed_clock:
+                counters[OWN_SCAN] += claim(cells, known, i * TILE, TILE, j * TILE)
+    node.claimed_clock = np.int64(clock)
+    if node.pending_clock != 0 or counters[OWN_SCAN] - node.told_cells >= SCAN_NEWS_CELLS:
+        return True
+    return now >= node.next_scan - rules.scan_period + SCAN_REST_S - _EPSILON_S
 
 
 @numba.njit(cache=True, nogil=True)
@@ -258,6 +277,7 @@ def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[n
         node.scans += 1
     node.scan_clock, node.pending_clock, node.pending_slot = node.pending_clock, 0, -1
     node.next_scan = now + rules.scan_period
+    node.told_cells = counters[OWN_SCAN]
     return True
 
 

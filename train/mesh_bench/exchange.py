@@ -50,10 +50,12 @@ def against_whole_maps(flight: Flight) -> Results:
     theirs = WholeMaps(flight, NEAR, rate_bps=NEAR.rate_bps)
     at_once = WholeMaps(flight, NEAR)
     lead, lead_at_once = [], []
+    ever = np.zeros_like(ours.meet().known())  # evidence for and against may cancel; whoever knew, knows
     while ours.ticks < len(flight.poses):
         for side in (ours, theirs, at_once):
             side.tick()
-        known = ours.known().sum(axis=(1, 2))
+        ever |= ours.known()
+        known = ever.sum(axis=(1, 2))
         lead.append((known - theirs.known().sum(axis=(1, 2))).tolist())
         lead_at_once.append((known - at_once.known().sum(axis=(1, 2))).tolist())
     sent = sum(ours.bytes_sent.values())
@@ -116,6 +118,7 @@ def _cut(now: float) -> bool:
 def _share_by_tick(team: Team) -> NDArray[np.float64]:
     """Fly to the end; return the mean share of the team's cells that its drones know, by tick."""
     shares = []
+    team.meet()
     while team.ticks < len(team.flight.poses):
         team.tick()
         shares.append(team.known().sum(axis=(1, 2)).mean() / max(1, team.own().any(axis=0).sum()))

@@ -42,7 +42,8 @@ class Team:
     keeps: bool = False
     """Whether every datagram is kept, with its time and sender, in `said`."""
     said: list[tuple[float, int, bytes]] = field(default_factory=list)
-    ticks: int = 0
+    ticks: int = -10
+    """How many ticks of the flight are over; they hover a second before it, as drones do that have just met."""
 
     def __post_init__(self) -> None:
         """Let everyone start."""
@@ -66,8 +67,8 @@ class Team:
 
     def tick(self, scans: bool = True) -> None:
         """Hear, map and speak, at the poses of the flight's next tick; after its end, or without scans, they hover."""
-        at = min(self.ticks, len(self.flight.poses) - 1)
-        scans = scans and self.ticks < len(self.flight.poses)
+        at = min(max(self.ticks, 0), len(self.flight.poses) - 1)
+        scans = scans and 0 <= self.ticks < len(self.flight.poses)
         self.ticks += 1
         now, poses = self.now, self.flight.poses[at]
         places = poses[:, :2]
@@ -87,6 +88,12 @@ class Team:
                 self.radio.send(node.id, datagram, now)
                 if self.keeps:
                     self.said.append((now, node.id, datagram))
+
+    def meet(self) -> Team:
+        """Let those in reach of each other hear of each other before the flight; return the team itself."""
+        while self.ticks < 0:
+            self.tick()
+        return self
 
     def fly(self) -> Team:
         """Fly to the end of the recording; return the team itself."""

@@ -2,8 +2,8 @@
 
 Drones in reach broadcast every scan, uncompressed, and whenever two come into reach of each other both broadcast their
 whole map: what they have seen and heard so far, one float32 for each cell of the level, to be summed into the
-others'. It costs no headers, seals or repeats here. Over a radio with a rate, scans go first, and a map that waits is
-replaced by a newer one.
+others'. Who is in reach they notice twice a second, as the mesh does by its statuses, but at no cost, and nothing costs
+headers, seals or repeats here. Over a radio with a rate, scans go first, and a map that waits is replaced by a newer one.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from imagine.train.mesh_bench.flights import TICK_S, Flight
 from imagine.train.mesh_bench.team import HALF_EXTENT_M, has_evidence
 
 _FLOAT_BYTES = 4
+_NOTICE_TICKS = 5
 
 
 @dataclass
@@ -54,6 +55,7 @@ class WholeMaps:
         self._medium = RadioMedium(drones, self.radio, rng, self.flight.level.segments)
         self._maps = [EvidenceMap(number, HALF_EXTENT_M) for number in range(1, drones + 1)]
         self._told = np.zeros((drones, *self._maps[0].shape), np.bool_)
+        self._noticed = np.zeros((drones, drones), np.bool_)
         self._met = np.zeros((drones, drones), np.bool_)
         self._scans = [[] for _ in range(drones)]
         self._map = [None] * drones
@@ -67,6 +69,9 @@ class WholeMaps:
         tick, flight = self.ticks, self.flight
         self.ticks += 1
         reach = self._medium.in_reach(flight.poses[tick])[1:, 1:]
+        if tick % _NOTICE_TICKS == 0:
+            self._noticed = reach
+        in_touch = self._noticed & reach
         heard = [self._advance(sender) for sender in range(flight.drones)]
         for sender, messages in enumerate(heard):
             for receiver in np.flatnonzero(reach[sender]).tolist():
@@ -76,16 +81,17 @@ class WholeMaps:
             self._draw(self._maps[drone], drone, drone, tick)
         known = self.known()
         for drone in range(flight.drones):
-            if reach[drone].any():
+            if in_touch[drone].any():
                 self._scans[drone].append(_Waiting(self.scan_bytes, tick))
-            if (reach[drone] & ~self._met[drone]).any():
+            if (in_touch[drone] & ~self._met[drone]).any():
                 self.reconnections += 1
                 self._map[drone] = _Waiting(self.map_bytes, cells=known[drone])
-        self._met = reach
+        self._met = in_touch
 
     def known(self) -> NDArray[np.bool_]:
         """Tell of which cells each drone has evidence, `[drones, rows, columns]`."""
-        return np.array([has_evidence(evidence) for evidence in self._maps]) | self._told
+        self._told |= np.array([has_evidence(evidence) for evidence in self._maps])
+        return self._told.copy()
 
     def _advance(self, sender: int) -> list[_Waiting]:
         """Send for a tick; return what is complete."""
