@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 import imagine.train  # noqa: F401  sets up OpenMP before torch works
-from imagine.core.contract import CONTRACT_KEY, LidarContract, PolicyContract
+from imagine.core.contract import CONTRACT_KEY, STATE, LidarContract, PolicyContract
 from imagine.core.errors import InputError, WorkError
 from imagine.onboard.onnx_weights import hash_weights
 from imagine.onboard.policy import OnnxPolicy
@@ -31,6 +31,8 @@ logger = logging.getLogger(__name__)
 PARITY_TOLERANCE = 1e-5
 PARITY_OBSERVATIONS = 256
 _OPSET = 18
+_FRONTIERS = "frontiers"
+_CLEAR = 1e-4  # between scores, far more than they are rounded by
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,9 @@ def _to_onnx(actor: Actor) -> bytes:
 def parity(actor: Actor, model: bytes, observations: int = PARITY_OBSERVATIONS) -> float:
     """Return the largest difference between ONNX and torch over random observations, one batch and in small ones.
 
-    States are random too, so that what is remembered counts; they are in [-1, 1], as a memory's are.
+    States are random too, so that what is remembered counts; they are in [-1, 1], as a memory's are. Frontiers are
+    shown or not at random, as they are to drones: what lies between would decide alone which one is chosen. Where two
+    are as good as each other, rounding decides, and neither choice is wrong: such actions do not count.
     """
     rng = np.random.default_rng(0)
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
@@ -114,6 +118,9 @@ def parity(actor: Actor, model: bytes, observations: int = PARITY_OBSERVATIONS) 
         key: rng.uniform(-1.0, 1.0, (observations, *shape)).astype(np.float32) for key, shape in actor.shapes.items()
     }
     inputs["lidar"] = np.abs(inputs["lidar"])
+    if _FRONTIERS in inputs:
+        shown = (inputs[_FRONTIERS][..., :1] > 0.0).astype(np.float32)
+        inputs[_FRONTIERS] = shown * np.concatenate([shown, inputs[_FRONTIERS][..., 1:]], axis=2)
     worst = 0.0
     for rows in (slice(0, observations), *(slice(i, i + 1) for i in range(16)), slice(16, 19)):
         part = {key: value[rows] for key, value in inputs.items()}
@@ -121,11 +128,25 @@ def parity(actor: Actor, model: bytes, observations: int = PARITY_OBSERVATIONS) 
             given = actor(*(torch.from_numpy(part[key]) for key in actor.inputs))
         expected = given if isinstance(given, tuple) else (given,)
         found = session.run(list(actor.outputs), part)
-        for one, other in zip(found, expected, strict=True):
+        decided = [_decided(actor, part)] + [np.ones(len(other), bool) for other in expected[1:]]
+        for one, other, counts in zip(found, expected, decided, strict=True):
             if one.shape != tuple(other.shape) or not np.isfinite(one).all():
                 return math.inf
-            worst = max(worst, float(np.abs(one - other.numpy()).max()))
+            worst = max(worst, float(np.abs(one - other.numpy())[counts].max(initial=0.0)))
     return worst
+
+
+def _decided(actor: Actor, inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.bool_]:
+    """Tell in which rows one frontier is clearly the best, bool `[rows]`; in all where none is chosen from."""
+    seen = {key: torch.from_numpy(inputs[key]) for key in actor.inputs}
+    rows = len(inputs["motion"])
+    with torch.no_grad():
+        scores = actor.decide(seen, seen.pop(STATE, None), drones=rows if actor.is_central else 1).scores
+    if scores is None or scores.shape[1] < 2:
+        return np.ones(rows, bool)
+    best = scores.topk(2, dim=1).values
+    clear: NDArray[np.bool_] = (best[:, 0] - best[:, 1] > _CLEAR).numpy()
+    return clear
 
 
 def _contract(

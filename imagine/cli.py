@@ -227,13 +227,17 @@ def train(
     from rich.console import Console
 
     from imagine.kernel_cache import announce_compiling
-    from imagine.train.report import LiveReporter, LogReporter
+    from imagine.train.report import LiveReporter, LogReporter, Reporter
     from imagine.train.trainer import train as run_training
 
     announce_compiling(lambda text: print(text, file=sys.stderr))
     console = Console()
     with contextlib.ExitStack() as stack:
-        report = stack.enter_context(LiveReporter(console)) if console.is_terminal else LogReporter()
+        if console.is_terminal:
+            report: Reporter = stack.enter_context(LiveReporter(console))
+        else:  # in a file or a job's log a line now and then is all there is to see
+            logging.getLogger("imagine.train").setLevel(logging.INFO)
+            report = LogReporter()
         result = run_training(config, tuple(overrides or ()), resume, report)
     word = "finished" if result.finished else f"stopped; go on with: imagine train --resume {result.folder}"
     print(f"{result.folder}: {result.agent_steps} agent-steps, {word}")

@@ -119,6 +119,9 @@ def _metres(range_cap: float) -> NDArray[np.float32]:
     """Return the range in metres of every code up to the largest."""
     steps = np.arange(largest_code(range_cap) + 1) - FIRST_RANGE
     metres: NDArray[np.float32] = np.minimum(steps * RANGE_STEP_M, range_cap).astype(np.float32)
+    # nor rounded past it as float32, as 2.4 m would be: a receiver would draw free space where the hit is
+    beyond = metres.astype(np.float64) > range_cap
+    metres[beyond] = np.nextafter(metres[beyond], np.float32(0.0))
     metres[INVALID], metres[NO_RETURN] = np.nan, np.inf
     return metres
 

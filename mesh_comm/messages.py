@@ -148,9 +148,9 @@ _FIELDS = {kind.__struct_config__.tag: 1 + len(kind.__struct_fields__) for kind 
 
 
 class Unreadable(InputError):
-    """A message that was not read; `reason` is one word for the counters: malformed, version or kind.
+    """A message that was not read; `reason` is one word for the counters: malformed, wire-version, unknown-kind.
 
-    `version`: another `WIRE_VERSION`. `kind`: one that newer senders know, so nothing is wrong with it.
+    `wire-version`: another `WIRE_VERSION`. `unknown-kind`: one that newer senders know, so nothing is wrong with it.
     """
 
     def __init__(self, reason: str, message: str) -> None:
@@ -182,10 +182,10 @@ def decode(data: bytes) -> Message:
     """
     if not data or data[0] != WIRE_VERSION:
         version = data[0] if data else "none"
-        raise Unreadable("version", f"mesh message of wire version {version}, expected {WIRE_VERSION}")
+        raise Unreadable("wire-version", f"mesh message of wire version {version}, expected {WIRE_VERSION}")
     kind, _ = _array(data)
     if kind is not None and kind not in _FIELDS:
-        raise Unreadable("kind", f"mesh message of kind {kind}, known are {', '.join(map(str, _FIELDS))}")
+        raise Unreadable("unknown-kind", f"mesh message of kind {kind}, known are {', '.join(map(str, _FIELDS))}")
     try:
         message = _decoder.decode(memoryview(data)[1:])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

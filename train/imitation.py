@@ -135,10 +135,12 @@ def learn(
     settings: ImitationSettings,
     generator: torch.Generator,
 ) -> float:
-    """Take a round's gradient steps toward the labels; return the mean loss.
+    """Take a round's gradient steps toward the labels; return the mean loss, nan where there is no label yet.
 
     Raises WorkError where a loss or gradient is not finite, before it reaches the weights.
     """
+    if not len(buffer):
+        return math.nan
     losses = []
     with at_precision(settings.precision, actor):
         for _ in range(settings.gradient_steps):

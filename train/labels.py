@@ -28,6 +28,8 @@ class LabelBuffer:
 
     def add(self, observations: Seen, labels: Tensor) -> None:
         """Take labelled observations `[samples, ...]`; the oldest give way."""
+        if not len(labels):
+            return
         if not self.arrays:
             halves = {key: value[:1].half() for key, value in observations.items()}
             self.arrays = {key: value[:, 0] for key, value in room_for(self.capacity, halves).items()}

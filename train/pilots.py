@@ -53,19 +53,3 @@ class RandomPilot:
         """Return a draw."""
         shape = (env.drones, env.settings.action.size)
         return np.stack([rng.uniform(-1.0, 1.0, shape).astype(np.float32) for rng in self._generators])
-
-
-class RescuePilot:
-    """The planner that also rescues in flight: each drone descends its own belief's frontier field."""
-
-    name = "frontier"
-
-    def begin(self, env: Exploration) -> None:
-        """Keep nothing."""
-
-    def forget(self, worlds: NDArray[np.bool_]) -> None:
-        """Keep nothing."""
-
-    def act(self, env: Exploration, observation: Observation) -> Actions:
-        """Return the planner's actions, nan where a drone is dead or sees no frontier."""
-        return env.planner_actions()

@@ -51,6 +51,10 @@ class Recall:
         """Return it as it is now."""
         return Recall(self.state.clone(), self.starts.clone())
 
+    def to(self, device: torch.device) -> Recall:
+        """Return it on another device."""
+        return Recall(self.state.to(device), self.starts.to(device))
+
 
 @dataclass
 class Rollout:
@@ -99,7 +103,7 @@ class Rollout:
         moved: dict[str, Any] = {}
         for key in fields(self):
             value = getattr(self, key.name)
-            if isinstance(value, Tensor):
+            if isinstance(value, Tensor | Recall):
                 moved[key.name] = value.to(device)
             elif key.name in ("observations", "last"):
                 moved[key.name] = {name: part.to(device) for name, part in value.items()}

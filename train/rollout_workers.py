@@ -7,6 +7,7 @@ for a rollout: how many workers share the worlds changes only how sums over a ba
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import itertools
 import os
@@ -59,7 +60,7 @@ class RolloutWorkers:
         self._parts = _parts(settings.worlds, workers)
         self._drones, self._ppo = settings.drones, ppo
         remote = ray.remote(num_cpus=1, max_restarts=0)(_Worker)
-        shared = ray.put(actor.cpu())
+        shared = ray.put(on_cpu(actor))
         self._workers: list[Any] = [
             remote.remote(settings.model_copy(update={"worlds": len(keys)}), seed, list(keys), ppo, shared, own)
             for keys, own in zip(self._parts, states, strict=True)
@@ -126,6 +127,11 @@ def rollout_workers(
         started = RolloutWorkers(settings, seed, ppo, actor, workers, state)
         stack.callback(started.close)
         yield started
+
+
+def on_cpu(actor: Actor) -> Actor:
+    """Return a copy for workers, which fly on processors; the actor that learns stays where it is."""
+    return copy.deepcopy(actor).cpu()
 
 
 def _parts(worlds: int, workers: int) -> list[range]:

@@ -65,6 +65,8 @@ class RunFolder:
         had, WorkError on a full disk.
         """
         check_tracking(settings.tracking)
+        for half_written in (path / "checkpoints").glob(".*.tmp"):  # by a process that was killed
+            half_written.unlink()
         drop_after(path / "metrics.jsonl", agent_steps)
         record = _read_record(path / "record.json")
         session = {"agent_steps": agent_steps, **run_record(settings), **session_record()}
@@ -80,14 +82,17 @@ class RunFolder:
     def save(self, checkpoint: Checkpoint, name: str | None = None) -> Path:
         """Write `latest.pt` and a copy of it, called `name` or by its step; of the latter the newest few are kept.
 
-        Raises WorkError on a full disk; the checkpoints there are stay as they are.
+        Later ones, of a run that was taken up again at an earlier checkpoint, stay. Raises WorkError on a full disk;
+        the checkpoints there are stay as they are.
         """
         latest = self.checkpoints / "latest.pt"
         save_checkpoint(checkpoint, latest)
         copy = f"{name}.pt" if name else f"step-{sum(checkpoint.agent_steps.values()):09d}.pt"
         save_checkpoint(checkpoint, self.checkpoints / copy)
-        for old in sorted(self.checkpoints.glob("step-*.pt"))[: -checkpoint.settings.run.keep_checkpoints]:
-            old.unlink()
+        if name is None:
+            until_now = sorted(path for path in self.checkpoints.glob("step-*.pt") if path.name <= copy)
+            for old in until_now[: -checkpoint.settings.run.keep_checkpoints]:
+                old.unlink()
         return latest
 
     def close(self) -> None:

@@ -8,6 +8,7 @@ from typing import Self
 from pydantic import Field, model_validator
 
 from imagine.core.config import Settings, load_settings
+from imagine.core.errors import InputError
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.curriculum_settings import CurriculumSettings
 from imagine.train.imitation import ImitationSettings
@@ -64,4 +65,7 @@ def load_train_settings(config: Path | None, overrides: tuple[str, ...] = ()) ->
     packaged = CONFIGS / f"{path.name}.yaml"
     if not path.exists() and path.parent == Path() and packaged.exists():
         path = packaged
+    if not path.exists() and path.parent == Path():
+        names = ", ".join(sorted(file.stem for file in CONFIGS.glob("*.yaml")))
+        raise InputError(f"{path}: no such file, and no packaged configuration; these are {names}")
     return load_settings(TrainSettings, path, overrides)

@@ -39,6 +39,10 @@ logger = logging.getLogger(__name__)
 _MOST_HOUSES = 5
 
 
+class _BrokenOff(Exception):
+    """Whoever waits for the final evaluation has asked for an end."""
+
+
 @dataclass(frozen=True)
 class RunResult:
     """How a run ended: finished, or stopped early by a signal and ready to be resumed."""
@@ -69,6 +73,8 @@ def train(
         if config is not None:
             raise InputError("a resumed run has its configuration already: give CONFIG or --resume, not both")
         run = resume if resume.is_dir() else resume.parent.parent
+        if not (resume.exists() and (run / "config.yaml").exists()):
+            raise InputError(f"--resume {resume}: no run to go on with: give a run's folder, or a checkpoint in one")
         settings = load_train_settings(run / "config.yaml", overrides)
         checkpoint = None if _is_before_its_first_checkpoint(resume) else load_checkpoint(resume)
         trainer = Trainer(settings, checkpoint)
@@ -103,8 +109,8 @@ class Trainer:
         # Set here, whatever OMP_NUM_THREADS says: sums are split by thread, and equal settings must give equal runs.
         torch.set_num_threads(self.settings.run.threads or len(os.sched_getaffinity(0)))
         self.learner = Learner.create(self.settings)
-        self.episodes = RecentEpisodes(self.settings.env.episode_ticks, self.settings.env.levels)
-        self._wall_before_s = 0.0
+        self.episodes = RecentEpisodes(self.settings.env.episode_ticks, self.curriculum.levels)
+        self._began, self._wall_before_s = time.monotonic(), 0.0
         self._source: RolloutSource | None = None
         self._last: Checkpoint | None = None
         self._take_up(None if self.resumed is None else self.resumed.env)
@@ -151,7 +157,10 @@ class Trainer:
         if self._last is not None:
             checkpoint = folder.save(self._last, "final" if finished else None)
         if finished and self.settings.run.final_episodes:
-            self._evaluate(checkpoint)
+            try:
+                self._evaluate(checkpoint)
+            except _BrokenOff:
+                logger.warning("trained to the end; its evaluation was broken off: imagine evaluate makes up for it")
         return RunResult(folder.path, checkpoint, sum(self.agent_steps.values()), finished, self.episodes.means())
 
     def _imitate(self) -> None:
@@ -278,16 +287,25 @@ class Trainer:
         )
 
     def _evaluate(self, checkpoint: Path) -> None:
-        """Evaluate the finished policy on every level and write the rows beside the checkpoints."""
+        """Evaluate the finished policy on every level and write the rows beside the checkpoints.
+
+        Episodes end as in `imagine evaluate`, though those of the training may have ended sooner (env.stop_coverage).
+        Raises _BrokenOff before the next level once `_stop` is set.
+        """
         settings = self.settings
+
+        def go_on(_level: str) -> None:
+            if self._stop.is_set():
+                raise _BrokenOff
+
         rows = evaluate(
-            policy_of(self.learner.actor, settings.run.name),
+            policy_of(self.learner.actor, settings.run.name, settings.env),
             levels=evaluated_levels(self.curriculum.levels),
             drones=(settings.env.drones,),
             protocol=settings.env.protocol,
             episodes=settings.run.final_episodes,
             seed=settings.run.seed + 1,
-            env=settings.env,
+            progress=go_on,
         )
         text = json.dumps({"checkpoint": checkpoint.name, "agent_steps": self.agent_steps, "rows": rows}, indent=2)
         write_atomically(self._folder.path / "evaluation.json", lambda file: file.write_text(text + "\n", "utf-8"))

@@ -14,6 +14,7 @@ from imagine.onboard.settings import DEFAULT_POLICY
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = (
+    "mesh_comm/chances.json",
     "core/*.py",
     "sim/levels/*.yaml",
     "gcs/web/*",

@@ -9,6 +9,7 @@ import torch
 
 from imagine.core.contract import CONTRACT_KEY, PolicyContract
 from imagine.core.errors import InputError, WorkError
+from imagine.core.observation_spec import ObservationSpec
 from imagine.export import onnx_export
 from imagine.export.onnx_export import export_onnx, inspect, parity
 from imagine.onboard.policy import OnnxPolicy
@@ -146,3 +147,18 @@ def test_a_model_that_differs_from_its_network_is_never_written(run, model, tmp_
 
 def test_the_exporter_leaves_the_log_alone(model):
     assert logging.getLogger("torch.onnx").level == logging.NOTSET
+
+
+@pytest.mark.parametrize("head", ["choice", "gaussian"])
+def test_the_proof_tells_networks_apart_that_see_frontiers(head):
+    """Of a choice, too, which is by the scores of all that is seen."""
+    spec = ObservationSpec(view_cells=16, lidar_sectors=17, frontiers=4)
+    small = NetworkSettings(head=head, view_channels=(4, 4, 4), critic_channels=(4, 4), lidar_channels=2, hidden=16)
+
+    def network(seed):
+        torch.manual_seed(seed)
+        return Actor(small, spec, 2).eval()
+
+    model = onnx_export._to_onnx(network(0))
+    assert parity(network(0), model) <= 1e-5
+    assert parity(network(1), model) > 1e-2

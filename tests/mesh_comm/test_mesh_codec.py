@@ -22,16 +22,29 @@ ranges_m = st.lists(
 )
 
 
-@given(ranges_m, st.sampled_from([0.05, 2.0, 4.0, 12.345, 30.0]))
+@given(ranges_m, st.sampled_from([0.05, 2.0, 2.4, 4.0, 12.345, 30.0]))
 def test_ranges_come_back_to_half_a_centimetre(values: list[float], cap: float) -> None:
     ranges = np.array(values, np.float32)
     back = unpack_ranges(pack_ranges(ranges, 0.05, cap), len(ranges), cap)
     measured = (ranges.astype(float) >= 0.05) & (ranges.astype(float) <= cap)
     assert np.all(np.abs(back[measured].astype(float) - ranges[measured]) <= 0.0051)
-    assert np.all(back[measured] <= np.float32(cap))
+    assert np.all(back[measured].astype(float) <= cap)
     assert np.all(np.isposinf(back) == (ranges.astype(float) > cap))
     assert np.all(np.isnan(back) == (np.isnan(ranges) | (ranges.astype(float) < 0.05)))
     assert pack_ranges(back, 0.0, cap) == pack_ranges(ranges, 0.05, cap)  # what was heard can be said again
+
+
+@pytest.mark.parametrize("cap", [2.4, 3.6, 4.0])  # as float32 the first is greater, the second less, the third equal
+def test_hits_just_inside_the_cap_are_drawn_as_their_source_drew_them(cap: float) -> None:
+    pose, ranges = Pose(0.05, 0.05, 0.0), np.full(LD19.beams, cap - 0.002, np.float32)
+    heard = unpack_ranges(pack_ranges(ranges, LD19.range_min, cap), LD19.beams, cap)
+    drawn = []
+    for seen in (ranges, heard):
+        evidence = EvidenceMap(1, half_extent_m=6.4)
+        evidence.integrate(pose, Scan(0.0, seen), LD19, cap)
+        drawn.append(evidence.layers[1].cells)
+    assert (drawn[0] > 0).sum() > 100
+    assert np.array_equal(*drawn)
 
 
 def room_turn(noise_m: float) -> NDArray[np.float32]:

@@ -521,10 +521,10 @@ def test_what_newer_nodes_say_is_counted_and_hurts_nothing() -> None:
     order = messages.encode(messages.Command("land", 2, 3))
     kind_6, version_3 = bytes((order[0],)) + b"\x92\x06\x01", b"\x03" + order[1:]
     for payload in (kind_6, version_3, version_3):
-        drone.node.receive(_FORGER.seal(payload), 0.0)
-    assert drone.node.stats == {"kind": 1, "version": 2}
+        drone.node.receive(_FORGER.seal(payload, 0.0), 0.0)
+    assert drone.node.stats == {"unknown-kind": 1, "wire-version": 2}
     status = msgspec.msgpack.decode(messages.encode(Status(1, 0.0, Pose(0.5, 0.0, 0.0)))[1:])
-    drone.node.receive(_FORGER.seal(order[:1] + msgspec.msgpack.encode([*status, "news"])), 0.0)
+    drone.node.receive(_FORGER.seal(order[:1] + msgspec.msgpack.encode([*status, "news"]), 0.0), 0.0)
     assert drone.node.newer == 1
     assert drone.node.peers(0.0)[1].is_live
     assert sum(drone.node.stats.values()) == 3

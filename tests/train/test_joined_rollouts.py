@@ -6,7 +6,8 @@ from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.joined_rollouts import joined
 from imagine.train.networks import Actor, NetworkSettings
-from imagine.train.rollout import Recall, collect
+from imagine.train.rollout import Recall, Rollout, collect
+from imagine.train.rollout_workers import on_cpu
 
 SPEC = ObservationSpec(view_cells=16, lidar_sectors=16)
 SETTINGS = ExplorationSettings(levels=("1",), worlds=2, drones=2, episode_ticks=5, observation=SPEC)
@@ -42,3 +43,18 @@ def test_worlds_flown_apart_are_a_rollout_like_those_flown_together(memory, monk
     if memory == "gru":
         torch.testing.assert_close(again.states, whole.states, rtol=1e-4, atol=1e-5)
         assert torch.equal(again.starts, whole.starts)
+
+
+def test_all_of_a_rollout_goes_to_another_device():
+    agents = Recall(torch.zeros(4, 8), torch.ones(4, dtype=torch.bool))
+    steps = torch.zeros(2, 4)
+    rollout = Rollout({}, steps, steps, steps, steps.bool(), {"motion": steps}, steps.bool(), recall=agents)
+    moved = rollout.to(torch.device("meta"))
+    places = (moved.actions, moved.last["motion"], moved.recall.state, moved.recall.starts)
+    assert {place.device.type for place in places} == {"meta"}
+
+
+def test_workers_get_a_copy_and_the_network_that_learns_stays_where_it_is():
+    actor = Actor(NetworkSettings(hidden=16, view_channels=(4, 4)), SPEC, 2)
+    pairs = list(zip(actor.parameters(), on_cpu(actor).parameters(), strict=True))
+    assert all(torch.equal(own, other) and own.data_ptr() != other.data_ptr() for own, other in pairs)

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -223,6 +225,18 @@ def test_the_buffer_keeps_the_newest_labels():
     batch = buffer.sample(500, torch.Generator().manual_seed(0))
     assert set(batch["labels"][:, 0].tolist()) == set(range(14, 24))
     assert torch.equal(batch["motion"][:, 0], batch["labels"][:, 0])
+
+
+def test_a_planner_without_advice_teaches_nothing():
+    """As at a launch from which all is seen: nothing is kept, and nothing learned until there is a label."""
+    actor, _, _, generator = learners()
+    buffer = LabelBuffer(10)
+    buffer.add({key: torch.zeros((0, *shape)) for key, shape in SPEC.shapes.items()}, torch.zeros((0, 2)))
+    before = actor.mean.weight.detach().clone()
+    assert math.isnan(learn(actor, torch.optim.Adam(actor.parameters()), buffer, ImitationSettings(), generator))
+    assert torch.equal(actor.mean.weight, before)
+    buffer.add({key: torch.ones((3, *shape)) for key, shape in SPEC.shapes.items()}, torch.ones((3, 2)))
+    assert len(buffer) == 3
 
 
 def test_a_rollout_holds_what_was_seen_done_and_earned():

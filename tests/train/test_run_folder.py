@@ -1,5 +1,6 @@
 """The folder of a run: what it records of code, command and resumptions."""
 
+import dataclasses
 import json
 import subprocess
 from pathlib import Path
@@ -12,6 +13,7 @@ from imagine.train.run_record import shown_command
 from imagine.train.settings import load_train_settings
 from imagine.train.tracking import code_state
 from imagine.train.tracking.code_state import code_state as state_of
+from imagine.train.trainer import Trainer
 
 
 def git(where, *arguments):
@@ -89,6 +91,8 @@ def test_what_a_run_is_resumed_with_is_taken_down(tmp_path):
     for step in (10, 20, 30):
         folder.log(step, {"ppo/kl": 0.1})
     folder.close()
+    folder.checkpoints.mkdir()
+    (folder.checkpoints / ".latest.pt.1234.tmp").write_text("half of a checkpoint, by a process that was killed")
     longer = load_train_settings(folder.path / "config.yaml", ("ppo.agent_steps=7",))
     again = RunFolder.reopen(folder.path, 20, longer)
     again.log(25, {"ppo/kl": 0.2})
@@ -100,6 +104,7 @@ def test_what_a_run_is_resumed_with_is_taken_down(tmp_path):
     assert resumed["config_sha256"] == config_hash(longer) != config_hash(settings)
     rows = [json.loads(line) for line in (folder.path / "metrics.jsonl").read_text().splitlines()]
     assert [row["agent_steps"] for row in rows] == [10, 20, 25]
+    assert not list(folder.checkpoints.iterdir())
 
 
 def test_a_damaged_record_is_named(tmp_path):
@@ -117,3 +122,14 @@ def test_the_folder_names_no_host(tmp_path):
     assert [Path(path).name for path in (folder.path / "tensorboard").iterdir()] == [
         "events.out.tfevents.000000000000.imagine"
     ]
+
+
+def test_the_newest_checkpoints_are_kept_and_those_of_a_given_up_future_too(tmp_path):
+    settings = load_train_settings(Path("smoke"), (f"run.root={tmp_path}", "run.keep_checkpoints=2"))
+    folder = RunFolder.create(settings)
+    whole = Trainer(settings).checkpoint()
+    for steps in (100, 200, 300, 400, 150):  # the last of a run that went on from an earlier one
+        folder.save(dataclasses.replace(whole, agent_steps={"imitation": 0, "ppo": steps}))
+    folder.close()
+    kept = sorted(path.stem for path in folder.checkpoints.glob("step-*.pt"))
+    assert kept == ["step-000000150", "step-000000300", "step-000000400"]

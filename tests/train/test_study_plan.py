@@ -181,3 +181,9 @@ def test_the_papers_experiments_are_there():
         "paradigms", "communication", "kill_on_collision", "curriculum", "actions_observations", "lidar_convolution",
         "rnn", "asha",
     }  # fmt: skip
+
+
+def test_lessons_that_no_episode_could_pass_are_refused_before_any_trial_starts():
+    lessons = 'curriculum.lessons=[{levels: ["0"], pass_area: 0.98}]'
+    with pytest.raises(InputError, match=r"pass_area is 0.98, but an episode ends at env.stop_coverage, 0.9"):
+        plan_trials(study(set=["curriculum.mode=sequential", lessons, "env.stop_coverage=0.9"]))

@@ -3,10 +3,12 @@
 import io
 import logging
 import re
+import sys
 
 import pytest
 from rich.console import Console
 
+from imagine.cli import main
 from imagine.train.report import LiveReporter, LogReporter, Report, one_line
 from imagine.train.tracking.episodes import TEAM_METRICS
 
@@ -75,3 +77,17 @@ def test_overall_figures_count_levels_alike():
     assert mixed.scalars()["paradigm/ctde/coverage"] == pytest.approx(0.75)
     assert mixed.scalars()["ppo/kl"] == 0.125
     assert report({}).overall == {}
+
+
+def test_without_a_terminal_the_command_writes_lines_to_the_log(tmp_path, monkeypatch, caplog):
+    """Else a run in a job's log would say nothing for hours."""
+    small = ("env.worlds=1", "imitation.agent_steps=0", "ppo.agent_steps=64", "env.observation.view_cells=16")
+    flags = [flag for text in (*small, f"run.root={tmp_path}", "run.threads=1") for flag in ("--set", text)]
+    monkeypatch.setattr(sys, "argv", ["imagine", "train", "smoke", *flags])
+    try:
+        with pytest.raises(SystemExit) as ended:
+            main()
+    finally:
+        logging.getLogger("imagine.train").setLevel(logging.NOTSET)
+    assert ended.value.code == 0
+    assert any(line.startswith("ppo 64/64") for line in caplog.messages)

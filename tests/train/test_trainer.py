@@ -2,6 +2,7 @@ import json
 import os
 import shutil
 import signal
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,16 @@ import torch
 import yaml
 
 from imagine.core.errors import InputError
+from imagine.sim import level as sim_level
 from imagine.train.checkpoint import load_checkpoint
+from imagine.train.evaluation import evaluate
 from imagine.train.learner import Learner
+from imagine.train.policies import load_policy
 from imagine.train.ppo import update
 from imagine.train.rollout import collect
+from imagine.train.run_folder import RunFolder
 from imagine.train.settings import load_train_settings
+from imagine.train.tracking.level_groups import MOST_FILES
 from imagine.train.trainer import Trainer, train
 
 TINY = (
@@ -173,3 +179,58 @@ def test_a_file_of_ones_own_names_its_line(tmp_path):
     path.write_text(yaml.safe_dump({"run": {"name": "a"}, "ppo": {"gama": 0.9}}, sort_keys=False))
     with pytest.raises(InputError, match=r"mine\.yaml:4: unknown key 'ppo\.gama'; did you mean 'gamma'"):
         train(path)
+
+
+def test_the_final_evaluation_does_not_end_where_training_episodes_do(tmp_path):
+    """It is what `imagine evaluate` says of the policy, whatever the training's stop_coverage."""
+    short = ("env.levels=['0']", "env.stop_coverage=0.3", "imitation.agent_steps=0", "run.final_episodes=1")
+    result = train(Path("smoke"), overrides(tmp_path, *short))
+    told = json.loads((result.folder / "evaluation.json").read_text())["rows"]
+    rows = evaluate(load_policy(result.folder), ("0",), drones=(2,), episodes=1, seed=1)
+    assert told == json.loads(json.dumps(rows))
+    assert rows[0]["coverage_mean"] > 0.3
+
+
+def test_a_stop_in_the_final_evaluation_is_heard(tmp_path, caplog):
+    """What was trained is finished and kept; its evaluation ends before the next level."""
+    settings = load_train_settings(Path("smoke"), overrides(tmp_path, "run.final_episodes=1", "ppo.agent_steps=128"))
+    stop, folder = threading.Event(), RunFolder.create(settings)
+    trainer = Trainer(settings)
+    save = folder.save
+
+    def save_then_stop(checkpoint, name=None):
+        latest = save(checkpoint, name)
+        if name == "final":
+            stop.set()
+        return latest
+
+    folder.save = save_then_stop
+    result = trainer.run(folder, lambda report: None, stop)
+    folder.close()
+    assert result.finished
+    assert not (folder.path / "evaluation.json").exists()
+    assert "evaluation was broken off" in caplog.text
+
+
+@pytest.mark.parametrize("given", ["nowhere", "nowhere/checkpoints/latest.pt", "."])
+def test_a_run_to_go_on_with_that_is_none_is_named(tmp_path, given):
+    with pytest.raises(InputError, match=r"--resume .*: no run to go on with: give a run's folder"):
+        train(None, resume=tmp_path / given)
+
+
+def test_an_unknown_configuration_is_named_with_those_there_are(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="no packaged configuration; these are curriculum, default, parallel, smoke"):
+        train(Path("smok"))
+
+
+def test_the_files_of_all_lessons_decide_how_episodes_are_grouped(tmp_path):
+    level = Path(sim_level.__file__).parent / "levels" / "0.yaml"
+    files = [tmp_path / f"plan{number}.yaml" for number in range(MOST_FILES + 1)]
+    for file in files:
+        shutil.copy(level, file)
+    lessons = json.dumps([{"levels": [str(file) for file in files]}])
+    settings = load_train_settings(
+        Path("smoke"), overrides(tmp_path, "curriculum.mode=parallel", f"curriculum.lessons={lessons}")
+    )
+    assert Trainer(settings).episodes.group_of("plan3") == "files"

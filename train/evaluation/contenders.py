@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import difflib
-import importlib
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from imagine.core.errors import InputError
 from imagine.onboard.settings import DEFAULT_POLICY
 from imagine.sim.exploration_settings import ExplorationSettings
-from imagine.train.pilots import Pilot, RandomPilot, RescuePilot
+from imagine.train.baselines import BASELINES, baseline
+from imagine.train.pilots import Pilot
 from imagine.train.policies import Policy, PolicyPilot, load_policy
 
-_PACKAGE = "imagine.train.baselines"
-_STRONGEST = ("coordinated", "frontier")  # which to compare with where none is named, the first that there is
+STRONGEST = "coordinated"
+"""The baseline that others are compared with where none is named."""
 
 
 @dataclass(frozen=True)
@@ -40,34 +37,10 @@ class Contender:
         return self.env is None
 
 
-def baseline_pilot(name: str, seed: int) -> Pilot:
-    """Return a baseline by its name; this is the one place that knows where they come from. Raises InputError."""
-    if importlib.util.find_spec(_PACKAGE) is not None:
-        pilot: Pilot = importlib.import_module(_PACKAGE).baseline(name, seed)
-        return pilot
-    if name == "random":
-        return RandomPilot(np.random.default_rng(seed))
-    if name == "frontier":
-        return RescuePilot()
-    raise InputError(f"{name}: no such baseline; there are {', '.join(baseline_names())}")
-
-
-def baseline_names() -> tuple[str, ...]:
-    """Return the names of the baselines that there are."""
-    if importlib.util.find_spec(_PACKAGE) is None:
-        return ("random", "frontier")
-    return tuple(importlib.import_module(_PACKAGE).BASELINES)
-
-
-def strongest_baseline() -> str:
-    """Return the name of the baseline that others are compared with where none is named."""
-    return next(name for name in _STRONGEST if name in baseline_names())
-
-
 def contender_of(who: Pilot | Policy | str, seed: int = 0) -> Contender:
     """Return a pilot, a network's policy, or a baseline given by its name, as a contender."""
     if isinstance(who, str):
-        return Contender(who, baseline_pilot(who, seed), given=who)
+        return Contender(who, baseline(who, seed), given=who)
     if isinstance(who, Policy):
         return Contender(who.name, PolicyPilot(who), who.env or ExplorationSettings(), who.name)
     return Contender(who.name, who, given=who.name)
@@ -78,7 +51,7 @@ def named_contender(given: str, seed: int = 0) -> Contender:
 
     A file goes before a shipped policy of that name. Raises InputError when it is none of these, with the nearest name.
     """
-    if given in baseline_names():
+    if given in BASELINES:
         return contender_of(given, seed)
     path = Path(given)
     shipped = DEFAULT_POLICY.parent / f"{given}.onnx"
@@ -91,7 +64,7 @@ def named_contender(given: str, seed: int = 0) -> Contender:
 
 def _nearest(given: str) -> str:
     """Say what may have been meant."""
-    names = [*baseline_names(), *sorted(path.stem for path in DEFAULT_POLICY.parent.glob("*.onnx"))]
+    names = [*BASELINES, *sorted(path.stem for path in DEFAULT_POLICY.parent.glob("*.onnx"))]
     close = difflib.get_close_matches(given, names, n=1, cutoff=0.5)
     if close:
         return f"; did you mean '{close[0]}'?"
@@ -128,7 +101,7 @@ def reference_of(
         if baselines:
             planners = [number for number in baselines if flown[number].name != "random"]
             return flown, (planners or baselines)[-1]
-        against = strongest_baseline()
+        against = STRONGEST
     for number, contender in enumerate(flown):
         if against in (contender.name, contender.given):
             return flown, number

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from imagine.core.errors import InputError
+from imagine.train.curriculum import Curriculum
 from imagine.train.settings import TrainSettings, load_train_settings
 from imagine.train.study.settings import StudySettings
 
@@ -80,6 +81,7 @@ def _trial(
     )
     try:
         settings = load_train_settings(Path(study.base), (*study.set, *overrides, *told, *decided))
+        Curriculum(settings.curriculum, settings.env)  # lessons that no episode could pass
     except InputError as error:
         raise InputError(f"study {study.name}: {condition or 'its only combination'}: {error}") from error
     return Trial(name, condition or "as configured", parameters, seed, _stopped_at(settings, study.stop.agent_steps))
