@@ -113,6 +113,8 @@ def mask_near(
     out = ranges
     for tx, ty in targets.tolist():
         away = math.hypot(tx - x, ty - y)
+        if away > spec.range_max + radius:
+            continue
         # only a return about as far away as the target can be on it; what is no return is neither nan nor finite here
         candidates = np.flatnonzero(np.abs(ranges - np.float32(away)) < radius + 1e-3)
         if not len(candidates):

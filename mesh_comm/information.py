@@ -15,9 +15,9 @@ FRONTIER_WORTH = 4
 TYPICAL_TILE_BYTES = 80
 """A packed tile of a flight, where its own size is not known yet."""
 SCAN_NEWS_CELLS = 8
-"""A scan goes out once it shows so many cells that no scan before it told of: fewer are not worth its bytes."""
-SCAN_REST_S = 1.0
-"""After so long a scan goes out that only changes what is known."""
+"""A scan goes out at once where it shows so many cells that no scan before it told of."""
+FEW_NEWS_S, NO_NEWS_S = 0.5, 2.0
+"""So long after the last scan one goes out that shows fewer, or none and only changes what is known."""
 _SCALE = 64
 MOST_DENSITY = 2**20 - 1
 """No tile ranks higher: all cells of a tile at the frontier, new to 31 peers, for 20 bytes."""

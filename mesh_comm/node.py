@@ -17,7 +17,7 @@ from imagine.mesh_comm import messages
 from imagine.mesh_comm.budget import TokenBucket
 from imagine.mesh_comm.codec import unpack_tile
 from imagine.mesh_comm.digest import Held, digests
-from imagine.mesh_comm.information import SCAN_NEWS_CELLS, SCAN_REST_S
+from imagine.mesh_comm.information import FEW_NEWS_S, NO_NEWS_S, SCAN_NEWS_CELLS
 from imagine.mesh_comm.map_inbox import MapInbox
 from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Command, Digest, Message, Status, Tiles, tile_key
 from imagine.mesh_comm.orders import Orders
@@ -190,7 +190,7 @@ class MeshNode:
         """Offer the node's own scan, taken at `pose`, for sending; call it after the scan was integrated into the map.
 
         A scan that changed nothing, or that nobody is near to hear, is not sent; nor, by the scheduler `information`,
-        one that shows hardly anything new within a second of the last. A newer scan replaces a waiting one.
+        one that shows little or nothing new soon after the last. A newer scan replaces a waiting one.
         """
         if self.id == GROUND:
             raise InputError("the ground station has no scans to offer")
@@ -209,9 +209,10 @@ class MeshNode:
 
     def _is_worth_telling(self, now: float) -> bool:
         """Tell whether what own scans have made known since the last one that was sent is worth another."""
-        if self.settings.scheduler == "fifo" or self._maps.own_cells - self._cells_told >= SCAN_NEWS_CELLS:
+        news = self._maps.own_cells - self._cells_told
+        if self.settings.scheduler == "fifo" or news >= SCAN_NEWS_CELLS:
             return True
-        return now >= self._scan_sent_at + SCAN_REST_S - _EPSILON_S
+        return now >= self._scan_sent_at + (FEW_NEWS_S if news > 0 else NO_NEWS_S) - _EPSILON_S
 
     def set_status(self, status: Status) -> None:
         """Set what the next status message tells; cells, bytes, links, rejections and command are filled in."""

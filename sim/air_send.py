@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from imagine.core.raster import TILE
-from imagine.mesh_comm.information import SCAN_NEWS_CELLS, SCAN_REST_S, known_cells
+from imagine.mesh_comm.information import FEW_NEWS_S, NO_NEWS_S, SCAN_NEWS_CELLS, known_cells
 from imagine.mesh_comm.messages import MAX_DATAGRAM
 from imagine.mesh_comm.seal import OVERHEAD
 from imagine.sim.air import (
@@ -155,9 +155,10 @@ def _is_worth_telling(node, now, rules, clock, cells, versions, known, counters)
             if np.int64(versions[i, j]) > node.claimed_clock:
                 counters[OWN_SCAN] += claim(cells, known, i * TILE, TILE, j * TILE)
     node.claimed_clock = np.int64(clock)
-    if node.pending_clock != 0 or counters[OWN_SCAN] - node.told_cells >= SCAN_NEWS_CELLS:
+    news = counters[OWN_SCAN] - node.told_cells
+    if node.pending_clock != 0 or news >= SCAN_NEWS_CELLS:
         return True
-    return now >= node.next_scan - rules.scan_period + SCAN_REST_S - _EPSILON_S
+    return now >= node.next_scan - rules.scan_period + (FEW_NEWS_S if news > 0 else NO_NEWS_S) - _EPSILON_S
 
 
 @numba.njit(cache=True, nogil=True)

@@ -222,8 +222,9 @@ def test_a_scan_is_drawn_ahead_of_its_tiles_and_exactly() -> None:
     provisional = ahead.air.state.notes[0, 1, 0]["provisional"]
     assert provisional.any()
     missing = ahead.layers[0, 0].astype(int) - ahead.layers[1, 0]
-    assert ahead.air.messages_sent[0, 0, SCAN] == 11  # from tick 2 on, when the others have been heard
-    assert 0 < np.abs(missing).max() <= 4  # the scan before anyone was heard, and one still in flight
+    sent = ahead.air.messages_sent[0, 0, SCAN]
+    assert 0 < sent < 11  # from tick 2 on, when the others have been heard, where a scan shows something new
+    assert (missing != 0).mean() < 0.05  # what only scans saw that were not worth telling, or are still in flight
     assert (ahead.dirty[1] > 0).any()
     changed = np.abs(ahead.layers[1, 0]).reshape(ahead.dirty.shape[1], TILE, -1, TILE).max(axis=(1, 3)) > 0
     assert (ahead.dirty[1][changed] == 1).all()

@@ -97,10 +97,9 @@ def throughput(flight: Flight, rounds: int) -> Results:
     }  # fmt: skip
 
 
-def _listener(flight: Flight) -> MeshNode:
-    return MeshNode(
-        EvidenceMap(200, HALF_EXTENT_M), flight.lidar, flight.range_cap_m, MeshSettings(), Sealer(_KEY, 200, BOOT)
-    )
+def _listener(flight: Flight, evidence: EvidenceMap | None = None) -> MeshNode:
+    evidence = evidence or EvidenceMap(200, HALF_EXTENT_M)
+    return MeshNode(evidence, flight.lidar, flight.range_cap_m, MeshSettings(), Sealer(_KEY, evidence.own, BOOT))
 
 
 def _contents(datagrams: Sequence[bytes]) -> list[messages.Message]:
@@ -114,10 +113,11 @@ def hostile(flight: Flight, datagrams: int, seed: int) -> Results:
     while team.ticks < min(len(flight.poses), 300):
         team.tick()
     sound = [said for _, _, said in team.said]
-    node = _listener(flight)
+    evidence = EvidenceMap(200, HALF_EXTENT_M)
+    node = _listener(flight, evidence)
     for datagram in sound:
         node.receive(datagram, team.now)
-    before, counted = _state(node), sum(node.stats.values())
+    before, counted = state(node, evidence), sum(node.stats.values())
     rng = np.random.default_rng(seed)
     play(node, sound, min(1000, datagrams), rng, team.now)
     resident = _resident_bytes()
@@ -127,7 +127,7 @@ def hostile(flight: Flight, datagrams: int, seed: int) -> Results:
     return {
         "hostile": {
             "value": datagrams, "unit": "datagrams", "refused": sum(node.stats.values()) - counted - min(1000, datagrams),
-            "state_changed": _state(node) != before, "resident_growth_bytes": _resident_bytes() - resident,
+            "state_changed": state(node, evidence) != before, "resident_growth_bytes": _resident_bytes() - resident,
             "per_s": round(datagrams / took), "reasons": node.stats,
         }
     }  # fmt: skip
@@ -157,10 +157,10 @@ def play(node: MeshNode, sound: Sequence[bytes], count: int, rng: np.random.Gene
         node.receive(bytes(datagram), now)
 
 
-def _state(node: MeshNode) -> tuple[object, ...]:
+def state(node: MeshNode, evidence: EvidenceMap) -> tuple[object, ...]:
     """Return what must not change: layers, peers, and what the node would say."""
     layers = tuple(
         (source, layer.boot, layer.clock, layer.cells.tobytes(), layer.versions.tobytes(), layer.provisional.tobytes())
-        for source, layer in sorted(node.evidence.layers.items())
+        for source, layer in sorted(evidence.layers.items())
     )
     return layers, repr(node.peers(0.0)), node.own_cells, node.scan_cells, node.map_cells, node.commands()
