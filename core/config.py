@@ -6,10 +6,10 @@ import difflib
 import reprlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from imagine.core.errors import InputError
 
@@ -18,6 +18,15 @@ class Settings(BaseModel):
     """Base of all settings: immutable, unknown keys refused, no silent conversion of text to numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _off_in_yaml(cls, data: Any) -> Any:
+        """Take a bare off, which YAML 1.1 reads as false, as the word where that is a choice."""
+        if not isinstance(data, dict):
+            return data
+        words = {name for name, field in cls.model_fields.items() if "off" in get_args(field.annotation)}
+        return {key: "off" if value is False and key in words else value for key, value in data.items()}
 
 
 S = TypeVar("S", bound=BaseModel)

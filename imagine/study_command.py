@@ -70,7 +70,7 @@ def study_and_show(
 
 
 def _packaged(file: Path) -> str:
-    if file.exists() or file.parent != Path():
+    if file.exists() or file.parent != Path() or (STUDIES / f"{file.name}.yaml").exists():
         return ""
     return f"; packaged studies: {', '.join(sorted(path.stem for path in STUDIES.glob('*.yaml')))}"
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from imagine.core.config import Settings
 from imagine.core.errors import InputError
@@ -82,11 +82,6 @@ class CurriculumSettings(Settings):
     max_agent_steps: int | None = Field(
         default=None, ge=1, description="decisions after which a lesson is given up and left; left out: never"
     )
-
-    @field_validator("mode", mode="before")
-    @classmethod
-    def _off_in_yaml(cls, mode: Any) -> Any:
-        return "off" if mode is False else mode  # YAML 1.1 reads a bare off as false
 
     @model_validator(mode="after")
     def _has_lessons(self) -> CurriculumSettings:

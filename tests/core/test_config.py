@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from hypothesis import given
@@ -143,3 +144,14 @@ def test_whatever_the_text_it_is_read_or_refused(text: str) -> None:
 def test_a_key_given_twice_is_refused_with_both_lines() -> None:
     with pytest.raises(InputError, match=r"^room\.yaml:3: key 'a\.b' stands in line 2 already$"):
         parse_yaml("a:\n  b: 1\n  b: 2\n", "room.yaml")
+
+
+class Link(Settings):
+    protocol: Literal["off", "one-hop"] = "one-hop"
+    sealed: bool = True
+
+
+def test_a_bare_off_is_the_word_where_that_is_a_choice(tmp_path: Path) -> None:
+    """YAML reads it as false, and `--set protocol=off` would be refused."""
+    assert load_settings(Link, write(tmp_path, "protocol: off\nsealed: off\n")) == Link(protocol="off", sealed=False)
+    assert load_settings(Link, None, ("protocol=off",)).protocol == "off"

@@ -187,3 +187,12 @@ def test_lessons_that_no_episode_could_pass_are_refused_before_any_trial_starts(
     lessons = 'curriculum.lessons=[{levels: ["0"], pass_area: 0.98}]'
     with pytest.raises(InputError, match=r"pass_area is 0.98, but an episode ends at env.stop_coverage, 0.9"):
         plan_trials(study(set=["curriculum.mode=sequential", lessons, "env.stop_coverage=0.9"]))
+
+
+def test_values_of_a_parameter_may_be_set_on_the_command_line():
+    wanted = ("repeats=1", 'parameters.grid.env.levels=[["4"], ["6"]]', "parameters.grid.env.drones=[2]")
+    trials = plan_trials(load_study_settings(STUDIES / "paradigms.yaml", wanted))
+    assert {(t.settings.env.levels, t.settings.env.drones) for t in trials} == {(("4",), 2), (("6",), 2)}
+    drawn = ("parameters.space.ppo.actor_lr={uniform: [0.5, 0.6]}", "samples=2", "repeats=1")
+    rates = [t.settings.ppo.actor_lr.start for t in plan_trials(load_study_settings(STUDIES / "asha.yaml", drawn))]
+    assert all(0.5 <= rate <= 0.6 for rate in rates)

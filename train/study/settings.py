@@ -24,6 +24,19 @@ _DECIDED_HERE = {
 }
 
 
+def _flat(keys: Any, before: str = "") -> Any:
+    """Return nested mappings as one by dotted keys, the last of equal ones; distributions are left as they are."""
+    if not isinstance(keys, dict):
+        return keys
+    flat: dict[str, Any] = {}
+    for key, value in keys.items():
+        if isinstance(value, dict) and not value.keys() <= Distribution.model_fields.keys():
+            flat |= _flat(value, f"{before}{key}.")
+        else:
+            flat[f"{before}{key}"] = value
+    return flat
+
+
 class Variant(Settings):
     """Settings that go together, under a name."""
 
@@ -36,6 +49,14 @@ class Parameters(Settings):
 
     grid: dict[str, list[Any]] = Field(default_factory=dict, description="values by setting, such as env.drones")
     space: dict[str, Distribution] = Field(default_factory=dict, description="distributions by setting")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _keys_in_one_piece(cls, data: Any) -> Any:
+        """Take `grid: {env: {drones: […]}}`, as `--set parameters.grid.env.drones=[…]` gives it, as `env.drones`."""
+        if not isinstance(data, dict):
+            return data
+        return {name: _flat(keys) if name in ("grid", "space") else keys for name, keys in data.items()}
 
     @field_validator("grid")
     @classmethod
