@@ -463,7 +463,7 @@ def payloads() -> list[bytes]:
     scan = scan_message(1, 1, Pose(0.5, 0.0, 0.0), room_scan(Pose(0.5, 0.0, 0.0), 0.0), LIDAR, CAP_M, 1170)
     made: list[messages.Message] = [
         scan,
-        Tiles(1, [Tile(key.column, key.row, version, cells)]),
+        Tiles(1, [Tile(key.column, key.row, version, cells)], boot=1),
         Tiles(3, [Tile(key.column, key.row, version, cells)]),
         *digests(0.0, {2: Held(1, sender.evidence.versions(1)), 3: Held(1, {})}, 1170),
         Digest(0.0, []),
@@ -484,7 +484,7 @@ def test_a_tile_far_outside_is_refused_and_memory_stays_bounded() -> None:
     shape = drone.evidence.shape
     cells = pack_tile(np.ones((32, 32), np.int8))
     for column, row in ((160, 0), (-160, 0), (0, 160), (160, -160)):
-        drone.node.receive(_FORGER.seal(messages.encode(Tiles(1, [Tile(column, row, 1, cells)])), 0.0), 0.0)
+        drone.node.receive(_FORGER.seal(messages.encode(Tiles(1, [Tile(column, row, 1, cells)], boot=1)), 0.0), 0.0)
     assert drone.evidence.shape == shape
     assert drone.node.stats["content"] == 4
     for source in range(3, 250):
@@ -495,9 +495,9 @@ def test_a_tile_far_outside_is_refused_and_memory_stays_bounded() -> None:
 @pytest.mark.parametrize(
     "tiles",
     [
-        Tiles(1, [Tile(0, 0, 1, b"\xff" * 900)]),
-        Tiles(2, [Tile(0, 0, 2**31, b"\xff" * 900)]),  # the listener's own
-        Tiles(1, [Tile(160, 0, 1, pack_tile(np.ones((32, 32), np.int8)))]),
+        Tiles(1, [Tile(0, 0, 1, b"\xff" * 900)], boot=1),
+        Tiles(2, [Tile(0, 0, 2**31, b"\xff" * 900)], boot=1),  # the listener's own
+        Tiles(1, [Tile(160, 0, 1, pack_tile(np.ones((32, 32), np.int8)))], boot=1),
         Tiles(200, [Tile(0, 0, 1, pack_tile(np.ones((32, 32), np.int8)))]),  # one source too many
     ],
     ids=["damaged", "own damaged", "far away", "too many sources"],
