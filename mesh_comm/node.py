@@ -90,7 +90,7 @@ class MeshNode:
         self._digest_at, self._digest_bytes = -np.inf, 0
         self._next_status = self._next_digest = self._next_scan = self._next_plan = -np.inf
         self._scan_since = self._scan_sent_at = -np.inf
-        self._scans_ahead = 0
+        self._scans_ahead = 1
         self._cells_told = 0
 
     # --- what comes in -----------------------------------------------------------------------------------------
@@ -380,7 +380,7 @@ class MeshNode:
         return True
 
     def _send_maps(self, out: list[bytes], now: float) -> bool:
-        """Send scan and tiles: the scan first, unless tiles have waited for their turn."""
+        """Send scan and tiles by turns; tiles that tell something new begin, for they tell most a byte."""
         while True:
             head = self._exchange.head
             if head is not None and (self._scan is None or self._is_tiles_turn(head)):
@@ -390,7 +390,7 @@ class MeshNode:
             elif self._scan is not None:
                 if not self._send_scan(out, now):
                     return False
-                self._scans_ahead = 0 if head is None else self._scans_ahead + 1
+                self._scans_ahead = 1 if head is None else self._scans_ahead + 1
             else:
                 return True
 

@@ -193,6 +193,7 @@ class Air:
         self.state.notes[world]["sent_tick"] = NEVER
         nodes = self.state.nodes[world]
         nodes["digest_at"] = -np.inf
+        nodes["scans_ahead"] = 1
         nodes["canvas"] = nodes["pending_slot"] = -1
         nodes["tokens"] = self.rules.burst
         for name in ("next_status", "next_digest", "next_scan", "next_plan", "next_repeats"):

@@ -131,7 +131,7 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
             )  # fmt: skip
             if not said:
                 continue
-        while True:  # as MeshNode._send_maps: the scan first, unless tiles have waited for their turn
+        while True:  # by turns, as MeshNode._send_maps
             if node.wanted > 0 and (node.pending_clock == 0 or _is_tiles_turn(node, air.wanted[world, drone, 0])):
                 if not _send_tiles(air, world, tick, drone, layers, versions):
                     break
@@ -139,7 +139,7 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
             elif node.pending_clock != 0:
                 if not _send_scan(rules, now, node, messages[drone], counters[drone], air.windows[world, drone]):
                     break
-                node.scans_ahead = node.scans_ahead + 1 if node.wanted > 0 else 0
+                node.scans_ahead = node.scans_ahead + 1 if node.wanted > 0 else 1
             else:
                 break
 
