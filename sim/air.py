@@ -78,7 +78,11 @@ WINDOW = _record(row=_INT, column=_INT, clock=_INT, x=_FLOAT, y=_FLOAT, yaw=_FLO
 """A scan in flight: the grid's row and column of its first mark (a whole number of tiles; both may lie off the grid),
 the sender's clock after the scan, and its pose."""
 TILE_NOTE = _record(
-    sent_version=np.uint32, sent_tick=np.int32, cost_version=np.uint32, cost=np.int16, sent_known=np.int16,
+    sent_version=np.uint32,
+    sent_tick=np.int32,
+    cost_version=np.uint32,
+    cost=np.int16,
+    sent_known=np.int16,
     provisional=np.uint8,
 )
 """What a drone notes of a source's tile: which version was sent last and when (by itself or by another that it heard),

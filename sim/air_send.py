@@ -98,7 +98,13 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
         can_offer = node.canvas >= 0 and now >= node.next_scan - _EPSILON_S and node.scans < air.windows.shape[2] - 1
         changed = shares and can_offer and np.int64(clocks[drone]) != node.scan_clock
         if changed and _is_worth_telling(
-            node, now, rules, clocks[drone], layers[drone, drone], versions[drone, drone], air.known[world, drone],
+            node,
+            now,
+            rules,
+            clocks[drone],
+            layers[drone, drone],
+            versions[drone, drone],
+            air.known[world, drone],
             counters[drone],
         ):
             # it replaces one that still waits; a slot stays free for the next canvas
