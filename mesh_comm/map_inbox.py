@@ -68,7 +68,7 @@ class MapInbox:
             self.scan_cells += self._known.claim_around(where.x, where.y, reach_m)
 
     def take_tiles(self, message: Tiles, is_source_near: bool, via: int, now: float) -> None:
-        """Merge tiles of another source, heard from node `via`. Raises InputError if any is damaged, before any is taken.
+        """Merge tiles of another source, heard from node `via`. Raises InputError if any is damaged, with none taken.
 
         `is_source_near`: these are copies passed on by a third node while the source itself is in reach. Then tiles
         that hold the source's scans are left alone: they show more than the copy, and the source will send its own.

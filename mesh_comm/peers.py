@@ -30,7 +30,7 @@ class Peer(NamedTuple):
 
 @dataclass
 class PeerRecord:
-    """Everything heard from one peer. Times are the listener's, seconds; `holdings` by source, empty before a digest."""
+    """Everything heard from one peer. Times are the listener's, seconds; `holdings` by source."""
 
     id: int
     boot: int

@@ -42,7 +42,7 @@ class _Sent(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """A tile that peers lack: `told` are the cells that it would tell each of them, `since` when it was first lacked."""
+    """A tile that peers lack, since when; `told`: the cells it would tell each of them, `worth` so much in all."""
 
     rank: tuple[float, ...]
     source: int

@@ -50,8 +50,8 @@ NODE = _record(
     scan_clock=_INT, pending_clock=_INT, pending_bytes=_INT, pending_slot=_INT, canvas=_INT, sequence=_INT,
     dropped=_INT, wanted=_INT, digest_unit=_INT, digest_units=_INT, digest_parts=_INT,
     first_message=_INT, messages=_INT, busy_slots=_INT, scans=_INT,
-    first_tile=_INT, tiles=_INT, first_digest=_INT, digests=_INT, scans_ahead=_INT, claimed_clock=_INT, told_cells=_INT, next_repeats=_FLOAT,
-    digest_at=_FLOAT, digest_bytes=_INT,
+    first_tile=_INT, tiles=_INT, first_digest=_INT, digests=_INT, scans_ahead=_INT,
+    claimed_clock=_INT, told_cells=_INT, next_repeats=_FLOAT, digest_at=_FLOAT, digest_bytes=_INT,
 )  # fmt: skip
 """What a drone's mesh node keeps: `tokens` bytes left to send, `busy_until` and `next_...` seconds, `pending_...` of a
 scan that waits to be sent (clock 0 for none); `canvas` the slot of scans that the next one is drawn in; `busy_slots` a
@@ -86,7 +86,7 @@ TILE_NOTE = _record(
     provisional=np.uint8,
 )
 """What a drone notes of a source's tile: which version was sent last and when (by itself or by another that it heard),
-what a version costs in bytes, how many cells it knew when it was sent last, and whether scans were drawn on it ahead."""
+what a version costs in bytes, how many cells it knew when sent last, and whether scans were drawn on it ahead."""
 
 
 BUDGET, LOSS, CLEAR_M, WALLED_M, BUDGET_DB, EXPONENT, WALL_DB = range(7)

@@ -25,8 +25,8 @@ def plan(air, world, tick, drone, live, layers, versions):  # type: ignore[no-un
     """Queue the tiles that some peer in touch, by its last digest, lacks.
 
     Those come first that tell most new cells a byte, then, once a period, those that only confirm: most lacking first,
-    then most outdated. The queue is `air.wanted` up to `wanted` of the drone's node; an entry is its rank and place in one number, least
-    first. `live` has a bit for each peer in touch.
+    then most outdated. The queue is `air.wanted` up to `wanted` of the drone's node; an entry is its rank and place in
+    one number, least first. `live` has a bit for each peer in touch.
     """
     rules, node, peers = air.rules, air.nodes[world, drone], air.peers[world, drone]
     rate, drones, tile_columns = rules.ticks_per_s, versions.shape[1], versions.shape[3]

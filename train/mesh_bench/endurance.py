@@ -91,7 +91,8 @@ def throughput(flight: Flight, rounds: int) -> Results:
     return {
         "received": {
             "value": round(max(rates)), "unit": "datagrams/s of CPU time", "datagrams": len(team.said),
-            "mix": dict(kinds), "us_each": {kind: round(by_kind[kind] / 1e3 / count, 1) for kind, count in kinds.items()},
+            "mix": dict(kinds),
+            "us_each": {kind: round(by_kind[kind] / 1e3 / count, 1) for kind, count in kinds.items()},
             "bytes_mean": round(float(np.mean([len(said) for _, _, said in team.said]))), "dropped": node.stats,
         }
     }  # fmt: skip
@@ -126,7 +127,8 @@ def hostile(flight: Flight, datagrams: int, seed: int) -> Results:
     took = time.thread_time() - started
     return {
         "hostile": {
-            "value": datagrams, "unit": "datagrams", "refused": sum(node.stats.values()) - counted - min(1000, datagrams),
+            "value": datagrams, "unit": "datagrams",
+            "refused": sum(node.stats.values()) - counted - min(1000, datagrams),
             "state_changed": state(node, evidence) != before, "resident_growth_bytes": _resident_bytes() - resident,
             "per_s": round(datagrams / took), "reasons": node.stats,
         }

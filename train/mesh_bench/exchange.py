@@ -1,4 +1,4 @@
-"""Measured on recorded explorations: agreement after a partition, bytes against whole maps, schedulers, handing over."""
+"""Measured on recorded flights: agreement after a partition, bytes against whole maps, schedulers, handing over."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def reunion(flight: Flight) -> Results:
     before = sum(team.bytes_sent.values())
     while not team.agrees() and team.now < end_s + _LIMIT_S:
         team.tick()
-    sent = {kind: count for kind, count in team.bytes_sent.items()}
+    sent = team.bytes_sent
     cells = int(team.own().sum())
     return {
         "partition_heals": {

@@ -35,7 +35,7 @@ class Flight(NamedTuple):
     @property
     def drones(self) -> int:
         """How many drones flew."""
-        return self.poses.shape[1]
+        return int(self.poses.shape[1])
 
     @property
     def seconds(self) -> float:

@@ -3,7 +3,7 @@
 Drones in reach broadcast every scan, uncompressed, and whenever two come into reach of each other both broadcast their
 whole map: what they have seen and heard so far, one float32 for each cell of the level, to be summed into the
 others'. Who is in reach they notice twice a second, as the mesh does by its statuses, but at no cost, and nothing costs
-headers, seals or repeats here. Over a radio with a rate, scans go first, and a map that waits is replaced by a newer one.
+headers, seals or repeats here. Over a radio with a rate, scans go first, and a newer map replaces one that waits.
 """
 
 from __future__ import annotations
