@@ -28,8 +28,8 @@ _LIMIT_S = 300.0
 def crowd(flight: Flight, minutes: float, progress: Callable[[str], None]) -> Results:
     """Let many drones explore with half of all datagrams lost and half a second of delay, then hover for `minutes`.
 
-    Seconds from the last scan until every drone holds every layer; and resident memory, early and late in the hour. In
-    the second half of it they look around again, so that something is said.
+    Seconds from the last scan until every drone holds every layer; and resident memory, in the first and in the last
+    quarter of the hovering, when they tell statuses and digests and scan no more.
     """
     radio = RadioSettings(range_m=1000.0, loss=0.5, latency_s=0.5)
     team = Team(flight, MeshSettings(), radio)
