@@ -40,12 +40,14 @@ class Layer:
     """What one source has seen: `cells` int8 `[rows, columns]`, and per tile its version and whether it is provisional.
 
     A tile is provisional when a peer's scan was drawn ahead of the tile itself: good for the belief, never relayed.
+    `boot` is the number of the source's start that all of it is of, the high part of every version.
     """
 
     cells: NDArray[np.int8]
     versions: NDArray[np.uint32]
     provisional: NDArray[np.bool_]
     clock: int = 0
+    boot: int = 0
 
     @staticmethod
     def empty(tile_rows: int, tile_columns: int) -> Layer:
@@ -104,6 +106,19 @@ class EvidenceMap:
         if source not in self.layers:
             self.layers[source] = Layer.empty(self.tile_rows, self.tile_columns)
         return self.layers[source]
+
+    def renew(self, source: int, boot: int) -> bool:
+        """Tell whether what start number `boot` of a source says still counts; a new start drops what was held before.
+
+        A version is (boot, clock): everything of a later start is newer than anything of an earlier one, of which
+        nothing is left once the later one is known.
+        """
+        layer = self.layer(source)
+        if boot > layer.boot:
+            if source != self.own and (layer.clock or layer.provisional.any()):
+                layer = self.layers[source] = Layer.empty(self.tile_rows, self.tile_columns)
+            layer.boot = boot
+        return boot == layer.boot
 
     def integrate(self, pose: Pose, scan: Scan, spec: LidarSpec, range_cap_m: float) -> int:
         """Add the drone's own scan, taken at `pose`, to its own layer; return how many cells changed."""
@@ -173,7 +188,7 @@ class EvidenceMap:
             raise InputError(f"a tile of source {source} came from outside, but only drone {source} writes it")
         if cells.shape != (TILE, TILE) or cells.dtype != np.int8:
             raise InputError(f"a tile is int8 {TILE}x{TILE}, got {cells.dtype} {cells.shape}")
-        if not 1 <= version < 2**32 or np.abs(cells.astype(np.int16)).max() > LIMIT:
+        if not 1 <= version < 2**32 or cells.max() > LIMIT or cells.min() < -LIMIT:
             raise InputError(f"tile {tuple(key)} of source {source}: version {version} or its cells are out of range")
         self._cover_tiles(key.column, key.row, key.column, key.row)
         layer = self.layer(source)
@@ -269,6 +284,6 @@ class EvidenceMap:
             new.cells[
                 row * TILE : (row + self.tile_rows) * TILE, column * TILE : (column + self.tile_columns) * TILE
             ] = old.cells
-            new.clock = old.clock
+            new.clock, new.boot = old.clock, old.boot
             self.layers[source] = new
         self.corner, self.tile_rows, self.tile_columns = low, rows, columns

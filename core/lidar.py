@@ -110,13 +110,19 @@ def mask_near(
     if len(targets) == 0:
         return ranges
     x, y, yaw = pose
-    r = np.where(np.isfinite(ranges), ranges, np.inf).astype(np.float64)
-    bearing = spec.bearings + yaw
-    with np.errstate(invalid="ignore"):
-        hit_x, hit_y = x + r * np.cos(bearing), y + r * np.sin(bearing)
-    out = ranges.copy()
-    for tx, ty in targets:
-        with np.errstate(invalid="ignore"):
-            near = (hit_x - tx) ** 2 + (hit_y - ty) ** 2 < radius * radius
-        out[near] = np.nan
-    return out
+    out = ranges
+    for tx, ty in targets.tolist():
+        away = math.hypot(tx - x, ty - y)
+        if away > spec.range_max + radius:
+            continue
+        # only a return about as far away as the target can be on it; what is no return is neither nan nor finite here
+        candidates = np.flatnonzero(np.abs(ranges - np.float32(away)) < radius + 1e-3)
+        if not len(candidates):
+            continue
+        r = ranges[candidates].astype(np.float64)
+        bearing = spec.start + yaw + candidates * spec.increment
+        near = (x + r * np.cos(bearing) - tx) ** 2 + (y + r * np.sin(bearing) - ty) ** 2 < radius * radius
+        if near.any():
+            out = out.copy() if out is ranges else out
+            out[candidates[near]] = np.nan
+    return out if out is not ranges else ranges.copy()

@@ -429,6 +429,23 @@ def bench_seal(
     bench_seal_and_show(datagrams, json_file)
 
 
+@bench_app.command("mesh")
+def bench_mesh(
+    level: Annotated[str | None, typer.Option(help="which level is explored; by default 6")] = None,
+    flights: Annotated[int | None, typer.Option(help="how many, to compare schedulers on; by default 4")] = None,
+    minutes: Annotated[float | None, typer.Option(help="a crowd hovers for so long; by default 60")] = None,
+    hostile: Annotated[int | None, typer.Option(help="so many false datagrams; by default 1000000")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="small and rough, in seconds")] = False,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure the mesh on recorded explorations: agreement, bytes, schedulers, a crowd, speed, hostile datagrams."""
+    _needs("torch", "train")
+    check_outputs(json_file)
+    from imagine.bench_mesh_command import bench_mesh_and_show
+
+    bench_mesh_and_show(level, flights, minutes, hostile, quick, json_file)
+
+
 @bench_app.command("twin")
 def bench_twin(
     level: Annotated[str, typer.Option(help="a level, 0 to 6, or a YAML file")] = "6",

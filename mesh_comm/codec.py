@@ -110,7 +110,8 @@ def unpack_versions(packed: bytes) -> dict[TileKey, int]:
     entries = np.empty((count, 3), np.int64)
     if not decode_entries(data, zeros, state, entries):
         raise InputError(f"mesh version list: {len(packed)} bytes do not tell of {count} tiles that a map can hold")
-    return {TileKey(column, row): version for column, row, version in entries.tolist()}
+    keys = map(TileKey._make, entries[:, :2].tolist())
+    return dict(zip(keys, entries[:, 2].tolist(), strict=True))
 
 
 @lru_cache(maxsize=8)

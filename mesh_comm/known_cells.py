@@ -4,11 +4,35 @@ from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 
 from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import IDENTITY, placed_bounds
 from imagine.core.raster import CELL, TILE
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(total, cells, row0, column0):  # type: ignore[no-untyped-def]
+    """Add to `total` (int16 `[rows, columns]`) as many of `cells` (int8), from (row0, column0) on."""
+    for i in range(total.shape[0]):
+        for j in range(total.shape[1]):
+            total[i, j] += np.int16(cells[np.uintp(row0 + i), np.uintp(column0 + j)])
+
+
+@numba.njit(cache=True, nogil=True)
+def _claim_known(total, known, row0, column0):  # type: ignore[no-untyped-def]
+    """Mark what is not zero in `total` in `known`, from (row0, column0) on; return how many cells were not before."""
+    fresh = np.int64(0)
+    for i in range(total.shape[0]):
+        row_fresh = np.int16(0)
+        for j in range(total.shape[1]):
+            row, column = np.uintp(row0 + i), np.uintp(column0 + j)
+            is_fresh = (total[i, j] != 0) & ~known[row, column]
+            row_fresh += np.int16(is_fresh)
+            known[row, column] |= is_fresh
+        fresh += np.int64(row_fresh)
+    return fresh
 
 
 class KnownCells:
@@ -54,17 +78,13 @@ class KnownCells:
         layers = self._evidence.placed()
         self._follow_growth()
         column, row = self._origin
-        window = (
-            slice(max(row0 - row, 0), max(row1 - row, 0)),
-            slice(max(column0 - column, 0), max(column1 - column, 0)),
-        )
-        known = self._known[window]
-        total = np.zeros(known.shape, np.int16)
+        rows, columns = self._known.shape
+        first_row, last_row = max(row0 - row, 0), min(max(row1 - row, 0), rows)
+        first_column, last_column = max(column0 - column, 0), min(max(column1 - column, 0), columns)
+        total = np.zeros((max(0, last_row - first_row), max(0, last_column - first_column)), np.int16)
         for cells in layers.values():
-            total += cells[window]
-        fresh = (total != 0) & ~known
-        known |= fresh
-        return int(np.count_nonzero(fresh))
+            _add(total, cells, first_row, first_column)
+        return int(_claim_known(total, self._known, first_row, first_column))
 
     def _follow_growth(self) -> None:
         origin, shape = self._evidence.origin_cells, self._evidence.shape

@@ -30,21 +30,36 @@ class MapInbox:
         self._settings = settings
         self._known = KnownCells(evidence)
         self._provenance = Provenance(evidence)
+        self._own_counted = 0  # the own clock up to which own cells are counted
 
     def note_own(self, pose: Pose, range_cap_m: float, stamp: float, now: float) -> None:
         """Note that an own scan of this stamp, taken at `pose`, was mapped, and count what own scans made known."""
         self._provenance.note_own(stamp, now)
         self._count_own(pose, range_cap_m)
+        self._own_counted = self._own_clock
 
-    def take_scan(self, scan: messages.Scan, teammates: NDArray[np.float64], now: float) -> None:
+    def renew(self, source: int, boot: int) -> bool:
+        """Tell whether what a source's start number `boot` says counts; what is held of earlier starts is dropped.
+
+        Raises InputError on one source too many.
+        """
+        self._check_source(source)
+        layer = self._evidence.layers.get(source)
+        if layer is not None and layer.boot < boot:
+            self._exchange.forget(source)
+            self._provenance.forget(source)
+        return self._evidence.renew(source, boot)
+
+    def take_scan(self, scan: messages.Scan, boot: int, teammates: NDArray[np.float64], now: float) -> None:
         """Draw a peer's scan, leaving out what lands on `teammates` (`[n, 2]` metres, the peer's frame).
 
         Raises InputError.
         """
-        self._check_source(scan.sender)
+        if not self.renew(scan.sender, boot):
+            return
         frame = self._evidence.placement(scan.sender)
         where = None if frame is None else scan.pose if frame == IDENTITY else compose(frame, scan.pose)
-        if where is not None:
+        if where is not None and self._own_counted != self._own_clock:
             self._count_own(where, scan.range_cap_m)
         draw_peer_scan(self._evidence, scan, teammates, self._settings.mask_radius_m)
         reach_m = scan.range_cap_m + 2 * CELL
@@ -53,17 +68,20 @@ class MapInbox:
             self.scan_cells += self._known.claim_around(where.x, where.y, reach_m)
 
     def take_tiles(self, message: Tiles, is_source_near: bool, via: int, now: float) -> None:
-        """Merge tiles of another source, heard from node `via`. Raises InputError on a bad one; those before stay.
+        """Merge tiles of another source, heard from node `via`. Raises InputError if any is damaged, with none taken.
 
         `is_source_near`: these are copies passed on by a third node while the source itself is in reach. Then tiles
         that hold the source's scans are left alone: they show more than the copy, and the source will send its own.
         """
-        self._check_source(message.source)
-        for tile in message.tiles:
-            key, cells = tile_key(tile), unpack_tile(tile.packed)
+        unpacked = [unpack_tile(tile.packed) for tile in message.tiles]
+        if not self.renew(message.source, message.boot):
+            return
+        for tile, cells in zip(message.tiles, unpacked, strict=True):
+            key = tile_key(tile)
             if is_source_near and self._evidence.is_provisional(message.source, key):
                 continue
-            self.own_cells += self._known.claim_tile(message.source, key)
+            if self._own_counted != self._own_clock:
+                self.own_cells += self._known.claim_tile(message.source, key)
             if self._exchange.merge(message.source, tile, cells):
                 self._provenance.note_tile(message.source, key, tile.version, via, now)
                 self.map_cells += self._known.claim_tile(message.source, key)
@@ -76,16 +94,13 @@ class MapInbox:
         """Return where the belief in the cell at (x, y), metres of the own frame, comes from."""
         return self._provenance.at(x, y)
 
+    @property
+    def _own_clock(self) -> int:
+        return self._evidence.layers[self._evidence.own].clock
+
     def _count_own(self, pose: Pose, range_cap_m: float) -> None:
         """Count the cells that own scans have made known within a scan's reach of `pose`, own frame."""
         self.own_cells += self._known.claim_around(pose.x, pose.y, range_cap_m + 2 * CELL)
-
-    def outgrow(self, version: int) -> None:
-        """After a restart, lift own tile versions above `version`, the greatest that a peer still holds."""
-        layer = self._evidence.layers[self._evidence.own]
-        if layer.clock < version < 2**30:  # a thousand days of scans: beyond it, nothing but damage
-            layer.clock = version + 1
-            layer.versions[layer.versions > 0] = layer.clock
 
     def _check_source(self, source: int) -> None:
         layers = self._evidence.layers

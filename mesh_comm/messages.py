@@ -38,6 +38,7 @@ NodeId = Annotated[int, Meta(ge=0, le=254)]
 SourceId = Annotated[int, Meta(ge=1, le=254)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Clock = Annotated[int, Meta(ge=0, le=2**31)]
+Boot = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 Tag = Annotated[str, Meta(max_length=32)]
 Column = Annotated[int, Meta(ge=-MAX_TILES, le=MAX_TILES)]
 
@@ -69,22 +70,29 @@ class Tile(Struct, array_like=True, frozen=True):
 
 
 class Tiles(Struct, tag=2, array_like=True, frozen=True):
-    """As many tiles of one source as fit the datagram; confirmed content only."""
+    """As many tiles of one source as fit the datagram; confirmed content only.
+
+    `boot` is the number of the source's start that they are of: with it their versions are greater than all of earlier
+    starts.
+    """
 
     source: SourceId
     tiles: Annotated[list[Tile], Meta(max_length=256)]
+    boot: Boot = 0
 
 
 class Holding(Struct, array_like=True, frozen=True):
     """Which tiles of `source` the sender holds, among the keys in the interval (after, until] (null: unbounded).
 
     `packed` lists the confirmed versions (`codec.pack_versions`); a key in the interval but not listed is not held.
+    All are of the source's start number `boot`; of earlier ones the sender holds nothing.
     """
 
     source: SourceId
     after: tuple[Column, Column] | None
     until: tuple[Column, Column] | None
     packed: bytes
+    boot: Boot = 0
 
 
 class Digest(Struct, tag=3, array_like=True, frozen=True):
@@ -98,7 +106,8 @@ class Status(Struct, tag=4, array_like=True, frozen=True):
     """How a drone is doing. The node fills in everything from `own_cells` on when it sends.
 
     `velocity` in the map frame, m/s; `battery` 0..1 or null where unknown; `mode` is the autopilot's; `ladder` the
-    decision ladder's state (policy, frontier, hold, land) and `reason` why; `links` seconds since each peer was heard.
+    decision ladder's state (policy, frontier, hold, land) and `reason` why; `links` seconds since each peer was heard;
+    `taught` how many cells peers learned by the drone's scans and tiles (`receipts.py`), summed over peers.
     """
 
     id: NodeId
@@ -118,6 +127,7 @@ class Status(Struct, tag=4, array_like=True, frozen=True):
     links: Annotated[dict[NodeId, float], Meta(max_length=32)] = {}
     rejected: Count = 0
     last_command: Count = 0
+    taught: Annotated[dict[Tag, Count], Meta(max_length=16)] = {}
 
 
 class Command(Struct, tag=5, array_like=True, frozen=True):

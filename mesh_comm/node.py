@@ -16,7 +16,8 @@ from imagine.core.lidar import LidarSpec, Scan, mask_near
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.budget import TokenBucket
 from imagine.mesh_comm.codec import unpack_tile
-from imagine.mesh_comm.digest import digests
+from imagine.mesh_comm.digest import Held, digests
+from imagine.mesh_comm.information import FEW_NEWS_S, NO_NEWS_S, SCAN_NEWS_CELLS
 from imagine.mesh_comm.map_inbox import MapInbox
 from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Command, Digest, Message, Status, Tiles, tile_key
 from imagine.mesh_comm.orders import Orders
@@ -24,15 +25,19 @@ from imagine.mesh_comm.peer_book import PeerBook
 from imagine.mesh_comm.peers import Peer, PeerRecord
 from imagine.mesh_comm.placement import Place, Placements
 from imagine.mesh_comm.provenance import CellProvenance
+from imagine.mesh_comm.receipts import Bought, Receipt
 from imagine.mesh_comm.scan_exchange import scan_message
 from imagine.mesh_comm.seal import Opened, Rejected, Sealer
 from imagine.mesh_comm.settings import MeshSettings
-from imagine.mesh_comm.tile_exchange import TileExchange
+from imagine.mesh_comm.tile_exchange import TileExchange, Wanted
 
 __all__ = ["MeshNode", "MeshSettings", "Peer"]
 
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4  # of a longer digest, this many go out per period, in turn
+_DIGEST_SHARE, _MOST_DIGEST_S = 0.125, 1.5  # where bytes are short, digests take so much of them, or come so late
+_SCANS_BEFORE_NEWS, _SCANS_BEFORE_REPEATS = 1, 4  # where bytes are short, so many scans go before a message of tiles
+_TOLD: tuple[Bought, ...] = ("scan", "tile")
 _EPSILON_S = 1e-6  # periods are whole ticks: rounding of their sum must not cost a tick
 _log = logging.getLogger(__name__)
 
@@ -66,6 +71,7 @@ class MeshNode:
         self._sealer = sealer
         self._max_payload = MAX_DATAGRAM - sealer.overhead
         self._bucket = TokenBucket(settings.rate_bytes_per_s, settings.burst_bytes)
+        evidence.layers[self.id].boot = sealer.boot
         evidence.shares_frame = settings.frame == "shared"
         self._placements = (
             None if evidence.shares_frame else Placements(evidence, settings.alignment, settings.launches)
@@ -81,8 +87,11 @@ class MeshNode:
         self._scan_clock = 0
         self._digests: deque[Digest] = deque()
         self._digest_turn = 0
+        self._digest_at, self._digest_bytes = -np.inf, 0
         self._next_status = self._next_digest = self._next_scan = self._next_plan = -np.inf
-        self._tiles_first = False
+        self._scan_since = self._scan_sent_at = -np.inf
+        self._scans_ahead = 1
+        self._cells_told = 0
 
     # --- what comes in -----------------------------------------------------------------------------------------
 
@@ -116,17 +125,24 @@ class MeshNode:
             if named != sender:
                 raise InputError(f"a message of {named}")
         takes_maps = self.id == GROUND or self.settings.protocol != "off"
+        if opened.boot < self._boot(sender):
+            self._dropped["old-life"] += 1  # held up on the way; a relay was faster with the news of the restart
+            return
         peer = self._peers.hear(opened, now)
+        if peer.met is None:
+            peer.met = self._evidence.versions(self.id)
+        if sender in self._evidence.layers:
+            self._renew(sender, opened.boot)
         match message:
             case Status():
                 peer.note_status(message, now)
             case Digest():
                 peer.note_digest(message, now, self.settings.max_sources)
-                self._maps.outgrow(max(peer.holdings.get(self.id, {}).values(), default=0))
+                self._exchange.receipts.settle(sender, peer.holds, now)
             case messages.Scan():
                 peer.note_pose(message.pose, message.stamp, now)
                 if takes_maps:
-                    self._maps.take_scan(message, self._not_walls(sender, now), now)
+                    self._maps.take_scan(message, opened.boot, self._not_walls(sender, now), now)
             case Tiles():
                 if takes_maps:
                     self._take_tiles(message, peer, now)
@@ -134,6 +150,9 @@ class MeshNode:
     def _take_tiles(self, message: Tiles, peer: PeerRecord, now: float) -> None:
         source = message.source
         is_relayed = source != peer.id
+        if message.boot < self._boot(source) or (source == self.id and message.boot != self._sealer.boot):
+            self._dropped["old-life"] += 1
+            return
         if source == self.id:
             for tile in message.tiles:
                 unpack_tile(tile.packed)
@@ -141,10 +160,25 @@ class MeshNode:
             return
         else:
             self._maps.take_tiles(message, is_relayed and self._peers.is_live(source, now), peer.id, now)
-        for tile in message.tiles:  # only now that all of it has proved sound: what is noted is kept
-            peer.note_held(source, tile_key(tile), tile.version)
-            if source != self.id:
+        # only now that all of it has proved sound: what is noted is kept
+        peer.note_held(source, message.boot, {tile_key(tile): tile.version for tile in message.tiles})
+        if source != self.id:
+            for tile in message.tiles:
                 self._exchange.note_overheard(source, tile, now)
+
+    def _boot(self, source: int) -> int:
+        """Return the number of the latest start of a node that is known of, 0 where none is."""
+        layer = self._evidence.layers.get(source)
+        return max(self._peers.boot(source), 0 if layer is None else layer.boot)
+
+    def _renew(self, source: int, boot: int) -> None:
+        """Take it that a peer is in start number `boot`: what an earlier one saw, from where it was, counts no more."""
+        layer = self._evidence.layers[source]
+        if layer.boot >= boot:
+            return
+        self._maps.renew(source, boot)
+        if self._placements is not None:
+            self._placements.forget(source)
 
     def _drop(self, reason: str, sender: int, error: InputError) -> None:
         self._dropped[reason] += 1
@@ -155,7 +189,8 @@ class MeshNode:
     def offer_scan(self, scan: Scan, pose: Pose, now: float) -> None:
         """Offer the node's own scan, taken at `pose`, for sending; call it after the scan was integrated into the map.
 
-        A scan that changed nothing, or that nobody is near to hear, is not sent. A newer scan replaces a waiting one.
+        A scan that changed nothing, or that nobody is near to hear, is not sent; nor, by the scheduler `information`,
+        one that shows little or nothing new soon after the last. A newer scan replaces a waiting one.
         """
         if self.id == GROUND:
             raise InputError("the ground station has no scans to offer")
@@ -164,9 +199,20 @@ class MeshNode:
         clock = self._evidence.layers[self.id].clock
         if now < self._next_scan - _EPSILON_S or clock == self._scan_clock or not self._peers.map_listeners(now):
             return
+        if self._scan is None and not self._is_worth_telling(now):
+            return
         masked = mask_near(scan.ranges, self._lidar, pose, self.teammates(now), self.settings.mask_radius_m)
         offered = Scan(scan.stamp, masked)
+        if self._scan is None:
+            self._scan_since = now
         self._scan = scan_message(self.id, clock, pose, offered, self._lidar, self._range_cap_m, self._max_payload)
+
+    def _is_worth_telling(self, now: float) -> bool:
+        """Tell whether what own scans have made known since the last one that was sent is worth another."""
+        news = self._maps.own_cells - self._cells_told
+        if self.settings.scheduler == "fifo" or news >= SCAN_NEWS_CELLS:
+            return True
+        return now >= self._scan_sent_at + (FEW_NEWS_S if news > 0 else NO_NEWS_S) - _EPSILON_S
 
     def set_status(self, status: Status) -> None:
         """Set what the next status message tells; cells, bytes, links, rejections and command are filled in."""
@@ -232,6 +278,11 @@ class MeshNode:
         return self._maps.map_cells
 
     @property
+    def receipts(self) -> dict[Bought, Receipt]:
+        """What the bytes of scans and tiles have bought so far: cells that peers learned."""
+        return self._exchange.receipts.by_kind
+
+    @property
     def has_namesake(self) -> bool:
         """Whether another node is known to have used this node's id since this one started; neither may go on."""
         return self._sealer.has_namesake
@@ -249,18 +300,11 @@ class MeshNode:
         if self._placements is not None and self._placements.advance(now):
             self._maps.note_placed()
         self._prepare(now)
-        steps = [self._send_claim, self._send_commands, self._send_status, self._send_digests]
-        steps += [self._send_tiles, self._send_scan] if self._tiles_first else [self._send_scan, self._send_tiles]
-        for step in steps:
+        for step in (
+            self._send_claim, self._send_commands, self._send_status, self._send_digests, self._send_maps,
+        ):  # fmt: skip
             if not step(out, now):
-                # out of bytes; scans must not starve tiles, so whichever went short goes first next time
-                if step == self._send_tiles:
-                    self._tiles_first = True
-                elif step == self._send_scan:
-                    self._tiles_first = False
-                break
-        else:
-            self._tiles_first = False
+                break  # out of bytes: what is left keeps its place
         return out
 
     def _prepare(self, now: float) -> None:
@@ -268,7 +312,12 @@ class MeshNode:
         has_readers = self.id == GROUND or (self.settings.protocol != "off" and self._peers.has_drone(now))
         if has_readers and now >= self._next_digest - _EPSILON_S:
             self._next_digest = now + self.settings.digest_period_s
-            held = {source: self._evidence.versions(source) for source in self._evidence.layers if source != self.id}
+            self._digest_at, self._digest_bytes = now, 0
+            held = {
+                source: Held(layer.boot, self._evidence.versions(source))
+                for source, layer in self._evidence.layers.items()
+                if source != self.id
+            }
             parts = digests(now, held, self._max_payload)
             turn = self._digest_turn % len(parts)
             self._digests = deque((parts[turn:] + parts[:turn])[:_DIGEST_DATAGRAMS])
@@ -312,6 +361,7 @@ class MeshNode:
             links=self._peers.ages(now, most=32),
             rejected=sum(self.stats.values()),
             last_command=self._orders.last_nonce,
+            taught={kind: self.receipts[kind].cells for kind in _TOLD},
         )
         if not self._send(full, "status", out, now):
             return False
@@ -323,23 +373,48 @@ class MeshNode:
             if not self._send(self._digests[0], "digest", out, now):
                 return False
             self._digests.popleft()
+            self._digest_bytes += len(out[-1])
+            if self.settings.scheduler == "information":
+                spread_s = self._digest_bytes / (_DIGEST_SHARE * self.settings.rate_bytes_per_s)
+                self._next_digest = max(self._next_digest, self._digest_at + min(_MOST_DIGEST_S, spread_s))
         return True
 
+    def _send_maps(self, out: list[bytes], now: float) -> bool:
+        """Send scan and tiles by turns; tiles that tell something new begin, for they tell most a byte."""
+        while True:
+            head = self._exchange.head
+            if head is not None and (self._scan is None or self._is_tiles_turn(head)):
+                if not self._send_tiles(out, now):
+                    return False
+                self._scans_ahead = 0
+            elif self._scan is not None:
+                if not self._send_scan(out, now):
+                    return False
+                self._scans_ahead = 1 if head is None else self._scans_ahead + 1
+            else:
+                return True
+
+    def _is_tiles_turn(self, head: Wanted) -> bool:
+        if self.settings.scheduler == "fifo":
+            return head.since <= self._scan_since
+        return self._scans_ahead >= (_SCANS_BEFORE_NEWS if head.brings_news else _SCANS_BEFORE_REPEATS)
+
     def _send_scan(self, out: list[bytes], now: float) -> bool:
-        if self._scan is None:
-            return True
-        if not self._send(self._scan, "scan", out, now):
+        if self._scan is None or not self._send(self._scan, "scan", out, now):
             return False
+        listeners = len(self._peers.map_listeners(now))
+        self._exchange.receipts.note_scan(len(out[-1]), (self._maps.own_cells - self._cells_told) * listeners)
+        self._cells_told = self._maps.own_cells
         self._scan_clock = self._scan.clock
         self._scan = None
-        self._next_scan = now + self.settings.scan_period_s
+        self._scan_sent_at, self._next_scan = now, now + self.settings.scan_period_s
         return True
 
     def _send_tiles(self, out: list[bytes], now: float) -> bool:
-        while (message := self._exchange.next_message(self._max_payload)) is not None:
-            if not self._send(message, "tile", out, now):
-                return False
-            self._exchange.note_sent(message, now)
+        message = self._exchange.next_message(self._max_payload)
+        if message is None or not self._send(message, "tile", out, now):
+            return False
+        self._exchange.note_sent(message, len(out[-1]), now)
         return True
 
     def _send(self, message: Message, kind: str, out: list[bytes], now: float) -> bool:

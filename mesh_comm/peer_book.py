@@ -38,8 +38,15 @@ class PeerBook:
         if record.boot != opened.boot:
             _log.warning("mesh peer %d has restarted", opened.sender)
             record.restart(opened.boot)
+        if now - record.heard_at > self._settings.peer_timeout_s:
+            record.met = None
         record.heard_at = now
         return record
+
+    def boot(self, id_: int) -> int:
+        """Return the number of the start that a peer was last heard in, 0 where it never was."""
+        record = self._records.get(id_)
+        return 0 if record is None else record.boot
 
     def is_live(self, id_: int, now: float) -> bool:
         """Tell whether a peer was heard lately."""

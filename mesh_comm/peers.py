@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from imagine.core.errors import InputError
 from imagine.core.evidence import TileKey
 from imagine.core.frames import Pose
 from imagine.mesh_comm.codec import unpack_versions
+from imagine.mesh_comm.digest import Held
 from imagine.mesh_comm.messages import Digest, Holding, Status
 
 _EXTRAPOLATE_S = 1.0  # a last known velocity says little about where a peer is later than this
@@ -28,7 +30,7 @@ class Peer(NamedTuple):
 
 @dataclass
 class PeerRecord:
-    """Everything heard from one peer. Times are the listener's, seconds; `holdings` by source, None before a digest."""
+    """Everything heard from one peer. Times are the listener's, seconds; `holdings` by source."""
 
     id: int
     boot: int
@@ -40,13 +42,15 @@ class PeerRecord:
     status: Status | None = None
     digest_at: float = -math.inf
     digest_stamp: float = -math.inf
-    holdings: dict[int, dict[TileKey, int]] = field(default_factory=dict)
+    holdings: dict[int, Held] = field(default_factory=dict)
+    met: dict[TileKey, int] | None = None
+    """The listener's own tile versions when the peer came into reach; None until they are noted."""
 
     def restart(self, boot: int) -> None:
         """Forget what ended with the peer's restart: its clock begins anew and its map is empty."""
         self.boot = boot
         self.pose_stamp = self.digest_stamp = self.digest_at = -math.inf
-        self.holdings = {}
+        self.holdings, self.met = {}, None
 
     def note_pose(self, pose: Pose, stamp: float, now: float) -> None:
         """Take a pose unless a newer one is known."""
@@ -70,19 +74,33 @@ class PeerRecord:
         if len({holding.source for holding in digest.holdings} | set(self.holdings)) > max_sources + 1:
             raise InputError(f"mesh digest of {self.id} makes more than {max_sources} sources")
         for holding, versions in lists:
-            known = self.holdings.get(holding.source, {})
-            kept = {key: version for key, version in known.items() if not _covers(holding, key)}
-            self.holdings[holding.source] = kept | versions
+            known = self.holdings.get(holding.source)
+            if known is None or known.boot != holding.boot:
+                known = Held(holding.boot, {})  # its layer of an earlier start is gone
+            if holding.after is not None or holding.until is not None:
+                kept = {key: version for key, version in known.versions.items() if not _covers(holding, key)}
+                versions = kept | versions
+            self.holdings[holding.source] = Held(holding.boot, versions)
         self.digest_stamp, self.digest_at = digest.stamp, now
 
-    def note_held(self, source: int, key: TileKey, version: int) -> None:
-        """Take it that the peer holds a tile, because it sent it."""
-        tiles = self.holdings.setdefault(source, {})
-        tiles[key] = max(version, tiles.get(key, 0))
+    def note_held(self, source: int, boot: int, versions: Mapping[TileKey, int]) -> None:
+        """Take it that the peer holds tiles, because it sent them."""
+        known = self.holdings.get(source)
+        if known is None or known.boot < boot:
+            known = Held(boot, {})
+        if known.boot == boot:
+            newer = {key: max(version, known.versions.get(key, 0)) for key, version in versions.items()}
+            self.holdings[source] = Held(boot, {**known.versions, **newer})
 
-    def holds(self, source: int, key: TileKey) -> int:
-        """Return the version of a tile the peer is known to hold, 0 for none."""
-        return self.holdings.get(source, {}).get(key, 0)
+    def holds(self, source: int, boot: int, key: TileKey) -> float:
+        """Return the version of a tile of a source's start that the peer is known to hold: 0 for none.
+
+        Infinite where the peer knows of a later start, for it takes nothing of this one.
+        """
+        known = self.holdings.get(source)
+        if known is None or known.boot < boot:
+            return 0
+        return known.versions.get(key, 0) if known.boot == boot else math.inf
 
     def hears(self, other: int, within_s: float) -> bool:
         """Tell whether the peer, by its last status, heard node `other` within the last seconds."""
@@ -98,6 +116,8 @@ class PeerRecord:
 
 def _versions(holding: Holding) -> dict[TileKey, int]:
     versions = unpack_versions(holding.packed)
+    if holding.after is None and holding.until is None:
+        return versions
     if not all(_covers(holding, key) for key in versions):
         raise InputError(f"mesh digest of source {holding.source} lists tiles outside its own interval")
     return versions

@@ -94,6 +94,16 @@ class Placements:
             return Place("unknown", None, 0, track.fit)
         return Place("candidate", None, track.confirmations, track.candidate.fit)
 
+    def forget(self, source: int) -> None:
+        """Take it that a peer has started anew, and with it its frame; a layout still says where that begins."""
+        self._tracks.pop(source, None)
+        if self._attempt is not None and self._attempt.source == source:
+            self._attempt = None
+        if source in self._layout:
+            self._tracks[source] = _Track(is_given=True)
+        if source != self._anchor:
+            self._evidence.place(source, self._layout.get(source))
+
     def advance(self, now: float) -> list[int]:
         """Do a slice of work at `now`, seconds; return the sources that were placed, moved or withdrawn by it."""
         if self._attempt is not None:

@@ -81,18 +81,24 @@ class Provenance:
 
     def note_scan(self, source: int, x: float, y: float, reach_m: float, stamp: float, now: float) -> None:
         """Note a peer's scan from (x, y), metres in its frame, on the tiles in reach that it turned provisional."""
-        side = CELL * TILE
-        for row in range(math.floor((y - reach_m) / side), math.floor((y + reach_m) / side) + 1):
-            for column in range(math.floor((x - reach_m) / side), math.floor((x + reach_m) / side) + 1):
-                key = TileKey(column, row)
-                if self._evidence.is_provisional(source, key):
-                    arrival = self._arrival(source, key)
-                    arrival.stamp, arrival.scan_at = stamp, now
+        side, corner = CELL * TILE, self._evidence.corner
+        row = max(0, math.floor((y - reach_m) / side) - corner.row)
+        column = max(0, math.floor((x - reach_m) / side) - corner.column)
+        last_row = max(0, math.floor((y + reach_m) / side) - corner.row)
+        last_column = max(0, math.floor((x + reach_m) / side) - corner.column)
+        provisional = self._evidence.layers[source].provisional[row : last_row + 1, column : last_column + 1]
+        for i, j in np.argwhere(provisional).tolist():
+            arrival = self._arrival(source, TileKey(column + j + corner.column, row + i + corner.row))
+            arrival.stamp, arrival.scan_at = stamp, now
 
     def note_tile(self, source: int, key: TileKey, version: int, via: int, now: float) -> None:
         """Note a tile that was taken into the map, heard from node `via`."""
         arrival = self._arrival(source, key)
         arrival.version, arrival.via, arrival.tile_at = version, via, now
+
+    def forget(self, source: int) -> None:
+        """Drop what is noted of a source, whose layer was dropped."""
+        self._arrivals.pop(source, None)
 
     def at(self, x: float, y: float) -> CellProvenance:
         """Return where the belief in the cell at (x, y), metres of the own frame, comes from; nothing off the map."""
@@ -129,4 +135,8 @@ class Provenance:
         return Sighting(source, units, way, arrival.via, arrival.version, arrival.stamp, arrival.tile_at, provisional)
 
     def _arrival(self, source: int, key: TileKey) -> _Arrival:
-        return self._arrivals.setdefault(source, {}).setdefault(key, _Arrival())
+        arrivals = self._arrivals.setdefault(source, {})
+        arrival = arrivals.get(key)
+        if arrival is None:
+            arrival = arrivals[key] = _Arrival()
+        return arrival

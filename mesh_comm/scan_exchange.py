@@ -53,14 +53,10 @@ def draw_peer_scan(
     corner, side = evidence.corner, CELL * TILE
     row0, row1 = (math.floor(y / side) - corner.row for y in (pose.y - reach, pose.y + reach))
     column0, column1 = (math.floor(x / side) - corner.column for x in (pose.x - reach, pose.x + reach))
-    newer = [
-        (row, column)
-        for row in range(row0, row1 + 1)
-        for column in range(column0, column1 + 1)
-        if layer.versions[row, column] >= message.clock
-    ]
-    if len(newer) == (row1 - row0 + 1) * (column1 - column0 + 1):
+    contains = layer.versions[row0 : row1 + 1, column0 : column1 + 1] >= message.clock
+    if contains.all():
         return  # every tile in reach contains this scan
+    newer = [(row0 + row, column0 + column) for row, column in np.argwhere(contains).tolist()] if contains.any() else []
     kept = [(at, layer.cells[_cells(*at)].copy(), layer.provisional[at]) for at in newer]
     evidence.integrate_provisional(message.sender, pose, Scan(message.stamp, ranges), spec, cap)
     for at, cells, provisional in kept:

@@ -14,6 +14,10 @@ from imagine.mesh_comm.alignment import AlignmentSettings
 Protocol = Literal["off", "one-hop", "multi-hop"]
 """`off`: status only (the ground is still served); `one-hop`: own scans and tiles; `multi-hop`: relays too."""
 
+Scheduler = Literal["information", "fifo"]
+"""What goes first where bytes are short. `information`: what tells peers most new cells a byte; `fifo`: what waited
+longest, which only comparisons need."""
+
 Frame = Literal["shared", "layout", "unknown"]
 """`shared`: all drones map in one frame; `layout`: each in its own, begun where `layout` says; `unknown`: each in its
 own, found out from the maps."""
@@ -25,6 +29,7 @@ class MeshSettings(Settings):
     protocol: Protocol = "one-hop"
     rate_bytes_per_s: float = Field(default=31250.0, gt=0.0, description="bytes a second this node may send, sealed")
     burst_bytes: float = Field(default=6250.0, ge=1200.0, description="bytes it may send at once after a silence")
+    scheduler: Scheduler = "information"
     status_period_s: float = Field(default=0.5, gt=0.0)
     digest_period_s: float = Field(default=0.5, gt=0.0)
     scan_period_s: float = Field(default=0.1, gt=0.0, description="at most one scan is sent per period")

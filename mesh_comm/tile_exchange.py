@@ -1,4 +1,4 @@
-"""Which tiles to send, in which order: whatever a peer's digest shows it lacks, most needed first, never too often."""
+"""Which tiles to send, in which order: whatever a peer's digest shows it lacks, most telling first, never too often."""
 
 from __future__ import annotations
 
@@ -9,18 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.evidence import EvidenceMap, TileKey
+from imagine.core.frames import IDENTITY
+from imagine.core.raster import TILE
 from imagine.mesh_comm.codec import pack_tile
+from imagine.mesh_comm.information import TYPICAL_TILE_BYTES, density, known_cells, tile_news, unsent_share
 from imagine.mesh_comm.messages import GROUND, Tile, Tiles, tile_key
 from imagine.mesh_comm.peers import PeerRecord
+from imagine.mesh_comm.receipts import Receipts
 from imagine.mesh_comm.settings import MeshSettings
 
 _TILE_BYTES = 16  # a tile beside its packed cells: place, version and lengths, at their longest
-_TILES_BYTES = 10
+_TILES_BYTES = 15
 _MOST_WANTED = 512
 _DIGEST_GRACE_S = 0.25  # a digest this soon after a tile was sent may have been written before the tile came
+_EPSILON_S = 1e-6
+_NOTHING = np.zeros((0, 0), np.int8)
 
 
-class Held(NamedTuple):
+class Content(NamedTuple):
     """A tile's content as its source confirmed it: what may be passed on."""
 
     version: int
@@ -28,14 +34,28 @@ class Held(NamedTuple):
 
 
 class _Sent(NamedTuple):
+    """When a tile was sent last, in which version, and how many cells it had evidence on."""
+
     version: int
     at: float
+    known: int
 
 
-class _Wanted(NamedTuple):
-    rank: tuple[int, int, bool]
+class Wanted(NamedTuple):
+    """A tile that peers lack, since when; `told`: the cells it would tell each of them, `worth` so much in all."""
+
+    rank: tuple[float, ...]
     source: int
     key: TileKey
+    since: float
+    told: dict[int, int]
+    worth: int
+    known: int
+
+    @property
+    def brings_news(self) -> bool:
+        """Whether it tells some peer a cell that it does not know, as far as is known here."""
+        return self.worth > 0
 
 
 class TileExchange:
@@ -43,12 +63,20 @@ class TileExchange:
 
     def __init__(self, evidence: EvidenceMap, settings: MeshSettings) -> None:
         """Serve the tiles of `evidence`."""
+        self.receipts = Receipts()
         self._evidence = evidence
         self._settings = settings
-        self._confirmed: dict[int, dict[TileKey, Held]] = {}
-        self._packed: dict[TileKey, Held] = {}
+        self._confirmed: dict[int, dict[TileKey, Content]] = {}
+        self._packed: dict[TileKey, Content] = {}
         self._sent: dict[tuple[int, TileKey], _Sent] = {}
-        self._queue: list[_Wanted] = []
+        self._since: dict[tuple[int, TileKey], float] = {}
+        self._queue: list[Wanted] = []
+        self._next_repeats = -np.inf
+
+    @property
+    def head(self) -> Wanted | None:
+        """The tile that goes out next, if any is wanted."""
+        return self._queue[0] if self._queue else None
 
     def merge(self, source: int, tile: Tile, cells: NDArray[np.int8]) -> bool:
         """Take a tile heard from a peer if it is newer than what is held; tell whether it was taken.
@@ -59,27 +87,44 @@ class TileExchange:
         if not self._evidence.merge_tile(source, key, tile.version, cells):
             return False
         # kept apart from the layer: scans drawn ahead of the next version must not be passed on
-        self._confirmed.setdefault(source, {})[key] = Held(tile.version, tile.packed)
+        self._confirmed.setdefault(source, {})[key] = Content(tile.version, tile.packed)
         return True
+
+    def forget(self, source: int) -> None:
+        """Drop the tiles of a source that has started anew."""
+        self._confirmed.pop(source, None)
+        self._sent = {of: sent for of, sent in self._sent.items() if of[0] != source}
+        self._queue = [wanted for wanted in self._queue if wanted.source != source]
 
     def note_overheard(self, source: int, tile: Tile, now: float) -> None:
         """Take it that those in reach have a tile another node just sent: no need to pass it on at once."""
         key = tile_key(tile)
         held = self._confirmed.get(source, {}).get(key)
         if held is None or held.version <= tile.version:
-            self._sent[source, key] = _Sent(tile.version, now)
+            self._sent[source, key] = _Sent(tile.version, now, self._known(source, key))
 
     def plan(self, peers: Sequence[PeerRecord], now: float) -> None:
-        """Make the queue anew: tiles that some of `peers`, by their digests, lack and that may be sent at `now`."""
-        wanted: list[_Wanted] = []
+        """Make the queue anew: tiles that some of `peers`, by their digests, lack and that may be sent at `now`.
+
+        By `information` those come first that tell most new cells a byte, with more for cells at a frontier; then those
+        that only confirm what scans have told, lacking before outdated ones; they are gathered for a period, so that a
+        datagram carries many. By `fifo` the longest wanted come first.
+        """
+        repeats = now >= self._next_repeats - _EPSILON_S or self._settings.scheduler == "fifo"
+        if repeats:
+            self._next_repeats = now + self._settings.tile_period_s
+        repeats = repeats or any(not tile.brings_news for tile in self._queue)
+        wanted: list[Wanted] = []
         by_id = {peer.id: peer for peer in peers}
         for source, key, version in self._available():
             last = self._sent.get((source, key))
-            if last is not None and now - last.at < self._settings.tile_period_s:
+            if last is not None and now - last.at < self._settings.tile_period_s - _EPSILON_S:
                 continue
             missing = stale = 0
+            lacking: list[tuple[PeerRecord, int]] = []
+            boot = self._evidence.layers[source].boot
             for peer in peers:
-                held = peer.holds(source, key)
+                held = peer.holds(source, boot, key)
                 if peer.id == source or held >= version:
                     continue
                 if last is not None and last.version >= version and peer.digest_at < last.at + _DIGEST_GRACE_S:
@@ -87,10 +132,14 @@ class TileExchange:
                 if self._serves_itself(by_id.get(source), peer):
                     continue
                 missing += held == 0
-                stale += version - held
+                stale += version - int(held)
+                lacking.append((peer, int(held)))
             if stale:
-                wanted.append(_Wanted((-missing, -stale, source != self._evidence.own), source, key))
-        wanted.sort()
+                wanted.append(self._ranked(source, key, missing, stale, lacking, now))
+        self._since = {(tile.source, tile.key): tile.since for tile in wanted}
+        if not repeats:
+            wanted = [tile for tile in wanted if tile.worth > 0]
+        wanted.sort(key=lambda tile: (tile.rank, tile.source, tile.key))
         self._queue = wanted[:_MOST_WANTED]
 
     def next_message(self, max_bytes: int) -> Tiles | None:
@@ -108,14 +157,73 @@ class TileExchange:
             if size > max_bytes or len(tiles) == 256:
                 break
             tiles.append(Tile(wanted.key.column, wanted.key.row, held.version, held.packed))
-        return Tiles(source, tiles)
+        return Tiles(source, tiles, self._evidence.layers[source].boot)
 
-    def note_sent(self, message: Tiles, now: float) -> None:
-        """Take the tiles of a message that went out off the queue."""
-        for tile in message.tiles:
-            self._sent[message.source, tile_key(tile)] = _Sent(tile.version, now)
-        gone = {(message.source, tile_key(tile)) for tile in message.tiles}
-        self._queue = [wanted for wanted in self._queue if (wanted.source, wanted.key) not in gone]
+    def note_sent(self, message: Tiles, size: int, now: float) -> None:
+        """Take the tiles of a message that went out, in `size` sealed bytes, off the queue."""
+        gone = {tile_key(tile): tile for tile in message.tiles}
+        packed = max(1, sum(len(tile.packed) for tile in message.tiles))
+        left: list[Wanted] = []
+        for wanted in self._queue:
+            tile = gone.get(wanted.key) if wanted.source == message.source else None
+            if tile is None:
+                left.append(wanted)
+                continue
+            self._sent[message.source, wanted.key] = _Sent(tile.version, now, wanted.known)
+            self._since.pop((wanted.source, wanted.key), None)
+            share = round(size * len(tile.packed) / packed)
+            self.receipts.note_tile(
+                message.source, message.boot, wanted.key, tile.version, share, wanted.told, now
+            )  # fmt: skip
+        self._queue = left
+
+    def _ranked(
+        self, source: int, key: TileKey, missing: int, stale: int, lacking: list[tuple[PeerRecord, int]], now: float
+    ) -> Wanted:
+        """Put a tile that `lacking` peers need, each with the version that it holds, in its place in the queue."""
+        since = self._since.get((source, key), now)
+        told: dict[int, int] = {}
+        worth, known = 0, 0
+        for peer, held in lacking:
+            cells, peer_worth, known = self._news(source, key, peer, held)
+            told[peer.id] = cells
+            worth += peer_worth
+        is_relay = source != self._evidence.own
+        if self._settings.scheduler == "fifo":
+            rank: tuple[float, ...] = (since,)
+        elif worth > 0:
+            rank = (0, -int(density(worth, self._packed_bytes(source, key))), is_relay)
+        else:
+            rank = (1, -missing, -stale, is_relay)
+        return Wanted(rank, source, key, since, told, worth, known or self._known(source, key))
+
+    def _news(self, source: int, key: TileKey, peer: PeerRecord, held: int) -> tuple[int, int, int]:
+        """Return (cells, worth, known): what a tile would tell a peer that holds version `held`, and what it knows.
+
+        What was seen since a peer came into reach, it has been told by scans.
+        """
+        own = self._evidence.own
+        if source == own and held >= (peer.met or {}).get(key, 0):
+            return 0, 0, 0
+        corner = self._evidence.corner
+        cells = self._evidence.layers[source].cells
+        theirs = self._evidence.layers.get(peer.id)
+        sees = theirs is not None and self._evidence.placement(peer.id) == self._evidence.placement(source) == IDENTITY
+        fresh, edge, known = tile_news(
+            cells, (key.row - corner.row) * TILE, (key.column - corner.column) * TILE,
+            theirs.cells if theirs is not None and sees else _NOTHING,
+        )  # fmt: skip
+        last = self._sent.get((source, key))
+        told, worth = unsent_share(fresh, edge, known, last.known if last is not None and held > 0 else 0)
+        return int(told), int(worth), int(known)
+
+    def _known(self, source: int, key: TileKey) -> int:
+        return int(known_cells(self._evidence.tile(source, key), 0, 0))
+
+    def _packed_bytes(self, source: int, key: TileKey) -> int:
+        """Return how long a tile was when it was packed last."""
+        held = self._packed.get(key) if source == self._evidence.own else self._confirmed[source][key]
+        return TYPICAL_TILE_BYTES if held is None else len(held.packed)
 
     def _serves_itself(self, source: PeerRecord | None, peer: PeerRecord) -> bool:
         """Tell whether source and peer hear each other, so that the source sends the peer its newest tiles itself."""
@@ -133,12 +241,12 @@ class TileExchange:
                 for key, held in tiles.items():
                     yield source, key, held.version
 
-    def _content(self, source: int, key: TileKey) -> Held:
+    def _content(self, source: int, key: TileKey) -> Content:
         if source != self._evidence.own:
             return self._confirmed[source][key]
         corner = self._evidence.corner
         version = int(self._evidence.layers[source].versions[key.row - corner.row, key.column - corner.column])
         held = self._packed.get(key)
         if held is None or held.version != version:
-            held = self._packed[key] = Held(version, pack_tile(self._evidence.tile(source, key)))
+            held = self._packed[key] = Content(version, pack_tile(self._evidence.tile(source, key)))
         return held

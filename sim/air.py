@@ -50,11 +50,14 @@ NODE = _record(
     scan_clock=_INT, pending_clock=_INT, pending_bytes=_INT, pending_slot=_INT, canvas=_INT, sequence=_INT,
     dropped=_INT, wanted=_INT, digest_unit=_INT, digest_units=_INT, digest_parts=_INT,
     first_message=_INT, messages=_INT, busy_slots=_INT, scans=_INT,
-    first_tile=_INT, tiles=_INT, first_digest=_INT, digests=_INT, tiles_first=np.bool_,
+    first_tile=_INT, tiles=_INT, first_digest=_INT, digests=_INT, scans_ahead=_INT,
+    claimed_clock=_INT, told_cells=_INT, next_repeats=_FLOAT, digest_at=_FLOAT, digest_bytes=_INT,
 )  # fmt: skip
 """What a drone's mesh node keeps: `tokens` bytes left to send, `busy_until` and `next_...` seconds, `pending_...` of a
 scan that waits to be sent (clock 0 for none); `canvas` the slot of scans that the next one is drawn in; `busy_slots` a
-bit for each slot in flight; `wanted` tiles are queued; rings have a first and a count. `dropped` messages found the
+bit for each slot in flight; `wanted` tiles are queued; `scans_ahead` scans went out while they waited; own cells are
+counted up to `claimed_clock`, and `told_cells` of them were by the last scan sent; the last digest
+was begun at `digest_at` and took `digest_bytes`; rings have a first and a count. `dropped` messages found the
 radio's queue full."""
 PEER = _record(
     heard_tick=_INT, pose_tick=_INT, status_tick=_INT, digest_tick=_INT, hears=_INT,
@@ -75,10 +78,15 @@ WINDOW = _record(row=_INT, column=_INT, clock=_INT, x=_FLOAT, y=_FLOAT, yaw=_FLO
 """A scan in flight: the grid's row and column of its first mark (a whole number of tiles; both may lie off the grid),
 the sender's clock after the scan, and its pose."""
 TILE_NOTE = _record(
-    sent_version=np.uint32, sent_tick=np.int32, cost_version=np.uint32, cost=np.int16, provisional=np.uint8
+    sent_version=np.uint32,
+    sent_tick=np.int32,
+    cost_version=np.uint32,
+    cost=np.int16,
+    sent_known=np.int16,
+    provisional=np.uint8,
 )
 """What a drone notes of a source's tile: which version was sent last and when (by itself or by another that it heard),
-what a version costs in bytes, and whether scans were drawn on it ahead."""
+what a version costs in bytes, how many cells it knew when sent last, and whether scans were drawn on it ahead."""
 
 
 BUDGET, LOSS, CLEAR_M, WALLED_M, BUDGET_DB, EXPONENT, WALL_DB = range(7)
@@ -114,7 +122,8 @@ class AirState(NamedTuple):
     `[..., drones]`; `counters` int64 `[..., 11]`. The rest: `nodes` NODE; `messages` MESSAGE, a ring; slots of scans,
     with `windows` WINDOW, `marks` int8 `[..., rows, columns]` and the `spans` of rows that hold any; rings of tiles
     (`tile_cells` int8, `tile_keys` place and version) and of digests (uint32 `[..., source, tile]`); `holdings` uint32
-    `[..., peer, source, tile]` the versions that peers are known to hold; `notes` TILE_NOTE `[..., source, tile]`;
+    `[..., peer, source, tile]` the versions that peers are known to hold, and `met` uint32 `[..., peer, tile]` the own
+    versions when a peer came into reach; `notes` TILE_NOTE `[..., source, tile]`;
     `wanted` int64 the queue of tiles; `known` int8 `[..., row, column]` the cells that ever had evidence; `confirmed`
     int8 `[..., source, row, column]` the cells of tiles as their source sent them, kept only for passing on.
     """
@@ -134,6 +143,7 @@ class AirState(NamedTuple):
     tile_keys: NDArray[np.int64]
     digests: NDArray[np.uint32]
     holdings: NDArray[np.uint32]
+    met: NDArray[np.uint32]
     notes: NDArray[np.void]
     wanted: NDArray[np.int64]
     known: NDArray[np.int8]
@@ -162,6 +172,8 @@ class Air:
         """
         if not 1 <= drones <= MOST_DRONES:
             raise InputError(f"the air holds 1 to {MOST_DRONES} drones a world, got {drones}")
+        if mesh.scheduler != "information":
+            raise InputError(f"the air of batches knows no scheduler '{mesh.scheduler}': only `information`")
         self.rules = _rules(radio, mesh, lidar, range_cap_m, tick_s)
         self._radio = radio
         self.state = _allocate(worlds, drones, tile_rows, tile_columns, self.rules)
@@ -184,9 +196,11 @@ class Air:
             self.state.peers[world][never] = NEVER
         self.state.notes[world]["sent_tick"] = NEVER
         nodes = self.state.nodes[world]
+        nodes["digest_at"] = -np.inf
+        nodes["scans_ahead"] = 1
         nodes["canvas"] = nodes["pending_slot"] = -1
         nodes["tokens"] = self.rules.burst
-        for name in ("next_status", "next_digest", "next_scan", "next_plan"):
+        for name in ("next_status", "next_digest", "next_scan", "next_plan", "next_repeats"):
             nodes[name] = -np.inf
 
     @property
@@ -264,6 +278,7 @@ def _allocate(worlds: int, drones: int, tile_rows: int, tile_columns: int, rules
         tile_keys=np.zeros((*per_drone, _MOST_TILES if exchanges else 1, 2), np.int64),
         digests=np.zeros((*per_drone, digests, drones, tiles), np.uint32),
         holdings=np.zeros((*per_peer, drones, tiles), np.uint32),
+        met=np.zeros((*per_peer, tiles), np.uint32),
         notes=np.zeros((*per_peer, tiles), TILE_NOTE),
         wanted=np.zeros((*per_drone, drones * tiles), np.int64),
         known=np.zeros((*per_drone, rows, columns), np.int8),

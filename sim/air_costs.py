@@ -14,21 +14,22 @@ from imagine.core.raster import LIMIT, RANGE_STEP_M, TILE
 from imagine.mesh_comm.messages import MAX_DATAGRAM
 from imagine.mesh_comm.seal import OVERHEAD
 
-SCAN_WEIGHTS = (5.429, 0.414, 0.403, 0.631)
+SCAN_WEIGHTS = (5.276, 0.417, 0.392, 0.716)
 """Bytes of a packed scan: in all, and per beam whose code differs from that before, by 8 or more, by 128 or more."""
-TILE_WEIGHTS = (3.789, 0.060, 0.551, 0.274, 0.194)
+TILE_WEIGHTS = (4.093, 0.047, 0.548, 0.295, 0.191)
 """Bytes of a packed tile: in all, per change along a row, per change that the row above has not, to a sure cell and to
 an unsure one, and per unsure cell."""
-VERSIONS_WEIGHTS = (-3.068, 1.947)
+VERSIONS_WEIGHTS = (-3.762, 1.924)
 """Bytes of a packed version list: in all, and per tile."""
 
 _SCAN_BYTES = OVERHEAD + 73  # wire version, array, tag, sender, stamp, pose, angles, beams, cap, length of the ranges
-_TILES_BYTES = OVERHEAD + 5  # wire version, array, tag, source, length of the list
+_TILES_BYTES = OVERHEAD + 10  # wire version, array, tag, source, length of the list, boot number
 _TILE_BYTES = 5  # array, column, row, length of the cells
 _DIGEST_BYTES = OVERHEAD + 13  # wire version, array, tag, stamp, length of the list
-_HOLDING_BYTES = 6  # array, source, two bounds of no interval, length of the versions
+_HOLDING_BYTES = 11  # array, source, two bounds of no interval, length of the versions, boot number
 _STATUS_TEXT_BYTES = 8 + 6 + 9  # "OFFBOARD", "policy", "exploring": what a drone that explores has to tell
-_STATUS_BYTES = OVERHEAD + 112 + _STATUS_TEXT_BYTES
+_TAUGHT_BYTES = 11 + 2 * 3  # the names scan and tile, and cells of each, up to 65535
+_STATUS_BYTES = OVERHEAD + 112 + _STATUS_TEXT_BYTES + _TAUGHT_BYTES
 _LINK_BYTES = 10  # id and seconds
 _LOWEST, _HIGHEST = np.int8(-LIMIT), np.int8(LIMIT)
 _STEPS_A_METRE = round(1.0 / RANGE_STEP_M)

@@ -5,23 +5,37 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from imagine.core.raster import TILE
+from imagine.mesh_comm.information import MOST_DENSITY, TYPICAL_TILE_BYTES, density, tile_news, unsent_share
 from imagine.sim.air import MOST_WANTED, NEVER
 
-_DIGEST_GRACE_S = 0.25  # as in mesh_comm.tile_exchange
+_DIGEST_GRACE_S, _EPSILON_S = 0.25, 1e-6  # as in mesh_comm.tile_exchange
 _ROWS, _PLACES, _SOURCES, _STALE, _MISSING = 1 << 12, 1 << 24, 1 << 6, 1 << 24, 1 << 6  # digits of a queue entry
+_NEWS = MOST_DENSITY + 1  # ranks below are of tiles that tell something new
 
 
 @numba.njit(cache=True, nogil=True)
-def plan(air, world, tick, drone, live, versions):  # type: ignore[no-untyped-def]
-    """Queue the tiles that some peer in touch, by its last digest, lacks: most lacking first, then most outdated.
+def brings_news(entry):  # type: ignore[no-untyped-def]
+    """Tell whether the tile of a queue entry tells some peer a cell that it does not know."""
+    return entry // (_PLACES * _SOURCES * 2) < _NEWS
 
-    The queue is `air.wanted` up to `wanted` of the drone's node; an entry is its rank and place in one number, least
-    first. `live` has a bit for each peer in touch.
+
+@numba.njit(cache=True, nogil=True)
+def plan(air, world, tick, drone, live, layers, versions):  # type: ignore[no-untyped-def]
+    """Queue the tiles that some peer in touch, by its last digest, lacks.
+
+    Those come first that tell most new cells a byte, then, once a period, those that only confirm: most lacking first,
+    then most outdated. The queue is `air.wanted` up to `wanted` of the drone's node; an entry is its rank and place in
+    one number, least first. `live` has a bit for each peer in touch.
     """
     rules, node, peers = air.rules, air.nodes[world, drone], air.peers[world, drone]
     rate, drones, tile_columns = rules.ticks_per_s, versions.shape[1], versions.shape[3]
     now = tick / rate
     wanted, holdings = air.wanted[world, drone], air.holdings[world, drone]
+    repeats = node.wanted > 0 and not brings_news(wanted[node.wanted - 1])
+    if now >= node.next_repeats - _EPSILON_S:
+        node.next_repeats, repeats = now + rules.tile_period, True
+    node.wanted = 0
     readers = 0  # a bit for each peer in touch that has told what it holds
     for peer in range(drones):
         if peers[peer].digest_tick >= 0:
@@ -38,9 +52,9 @@ def plan(air, world, tick, drone, live, versions):  # type: ignore[no-untyped-de
             note = notes[tile]
             was_sent = note.sent_tick > NEVER
             sent_at = note.sent_tick / rate
-            if was_sent and now - sent_at < rules.tile_period:
+            if was_sent and now - sent_at < rules.tile_period - _EPSILON_S:
                 continue
-            missing, stale = np.int64(0), np.int64(0)
+            missing, stale, worth = np.int64(0), np.int64(0), np.int64(0)
             for peer in range(drones):
                 has = np.int64(holdings[peer, source, tile])
                 if has >= version or (readers >> peer) & 1 == 0 or peer == source:
@@ -53,8 +67,17 @@ def plan(air, world, tick, drone, live, versions):  # type: ignore[no-untyped-de
                     continue  # the source sends this peer its newest tiles itself
                 missing += np.int64(has == 0)
                 stale += version - has
-            if stale > 0:
-                rank = (_MISSING - 1 - missing) * _STALE + _STALE - 1 - min(stale, np.int64(_STALE - 1))
+                if source != drone or has < np.int64(air.met[world, drone, peer, tile]):
+                    fresh, edge, known = tile_news(
+                        layers[drone, source], row * TILE, column * TILE, layers[drone, peer]
+                    )  # fmt: skip
+                    worth += unsent_share(fresh, edge, known, np.int64(note.sent_known) if has > 0 else 0)[1]
+            if worth > 0 or (stale > 0 and repeats):
+                if worth > 0:
+                    size = np.int64(note.cost) if note.cost_version > 0 else TYPICAL_TILE_BYTES
+                    rank = MOST_DENSITY - density(worth, size)
+                else:
+                    rank = (_MISSING - 1 - missing) * _STALE + _STALE - 1 - min(stale, np.int64(_STALE - 1)) + _NEWS
                 place = column * _ROWS + row  # ties in the order of tile keys
                 wanted[node.wanted] = ((rank * 2 + (source != drone)) * _SOURCES + source) * _PLACES + place
                 node.wanted += 1

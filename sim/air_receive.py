@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from imagine.core.raster import TILE
+from imagine.mesh_comm.information import known_cells
 from imagine.sim.air import (
     BUDGET_DB,
     CLEAR_M,
@@ -83,6 +84,8 @@ def deliver(air, world, tick, key, poses, alive, segments, layers, versions, dir
                 link.delivered += 1
                 link.delivered_bytes += message.size
                 peer = air.peers[world, receiver, sender]
+                if not is_live(peer, tick, rules):
+                    _meet(versions[receiver, receiver], air.met[world, receiver, sender])
                 _hear(peer, tick, message)
                 if message.kind == DIGEST:
                     peer.digest_tick = tick
@@ -170,6 +173,14 @@ def _chance(key, tick, sender, receiver, sequence):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, nogil=True)
+def _meet(versions, met):  # type: ignore[no-untyped-def]
+    """Note the own tile versions, `[tile rows, tile columns]`, that a peer finds when it comes into reach."""
+    for row in range(versions.shape[0]):
+        for column in range(versions.shape[1]):
+            met[row * versions.shape[1] + column] = versions[row, column]
+
+
+@numba.njit(cache=True, nogil=True)
 def _hear(peer, tick, message):  # type: ignore[no-untyped-def]
     """Note that a peer was heard, and where it says it is."""
     peer.heard_tick = tick
@@ -251,3 +262,4 @@ def _take_tiles(air, world, tick, sender, receiver, message, layers, versions, d
         if not is_own and held[i, j] <= version:
             # those in reach have it from the sender: no need to pass it on at once
             note.sent_version, note.sent_tick = version, tick
+            note.sent_known = known_cells(cells, i * TILE, j * TILE)

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from imagine.core.raster import TILE
+from imagine.mesh_comm.information import FEW_NEWS_S, NO_NEWS_S, SCAN_NEWS_CELLS, known_cells
 from imagine.mesh_comm.messages import MAX_DATAGRAM
 from imagine.mesh_comm.seal import OVERHEAD
 from imagine.sim.air import (
@@ -17,6 +18,7 @@ from imagine.sim.air import (
     BYTES_SENT,
     DIGEST,
     MESSAGES_SENT,
+    OWN_SCAN,
     SCAN,
     STATUS,
     TILES,
@@ -32,17 +34,19 @@ from imagine.sim.air_costs import (
     tile_in_message_bytes,
     tiles_message_bytes,
 )
-from imagine.sim.air_plan import plan, source_and_tile
+from imagine.sim.air_plan import brings_news, plan, source_and_tile
 from imagine.sim.air_receive import is_live
-from imagine.sim.air_tiles import copy_tile, find_spans
+from imagine.sim.air_tiles import claim, copy_tile, find_spans
 
 # these are those of mesh_comm.node, tile_exchange and digest
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4
+_DIGEST_SHARE, _MOST_DIGEST_S = 0.125, 1.5
+_SCANS_BEFORE_NEWS, _SCANS_BEFORE_REPEATS = 1, 4
 _EPSILON_S = 1e-6
 _MAX_PAYLOAD = MAX_DATAGRAM - OVERHEAD
-_RESERVED_TILE, _RESERVED_TILES = 16, 10
-_RESERVED_HOLDING, _RESERVED_DIGEST = 24, 24
+_RESERVED_TILE, _RESERVED_TILES = 16, 15
+_RESERVED_HOLDING, _RESERVED_DIGEST = 29, 24
 _MOST_TILES = 256
 
 
@@ -92,7 +96,17 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
                 live |= 1 << peer
         shares = live != 0 and rules.shares
         can_offer = node.canvas >= 0 and now >= node.next_scan - _EPSILON_S and node.scans < air.windows.shape[2] - 1
-        if shares and can_offer and np.int64(clocks[drone]) != node.scan_clock:
+        changed = shares and can_offer and np.int64(clocks[drone]) != node.scan_clock
+        if changed and _is_worth_telling(
+            node,
+            now,
+            rules,
+            clocks[drone],
+            layers[drone, drone],
+            versions[drone, drone],
+            air.known[world, drone],
+            counters[drone],
+        ):
             # it replaces one that still waits; a slot stays free for the next canvas
             node.pending_slot, node.pending_clock = node.canvas, np.int64(clocks[drone])
             packed = packed_ranges_bytes(ranges[drone], rules.range_min, rules.range_cap)
@@ -106,11 +120,10 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
             node.next_digest = now + rules.digest_period
             node.digest_units = layers.shape[1] * _units(versions.shape[2] * versions.shape[3])
             node.digest_parts = _DIGEST_DATAGRAMS
+            node.digest_at, node.digest_bytes = now, 0
         if now >= node.next_plan - _EPSILON_S:
             node.next_plan = now + _PLAN_PERIOD_S
-            node.wanted = 0
-            if shares:
-                plan(air, world, tick, drone, live, versions)
+            plan(air, world, tick, drone, live if rules.shares else 0, layers, versions)
         if now >= node.next_status - _EPSILON_S:
             said = _send_status(
                 rules, now, node, messages[drone], counters[drone], peers[drone], poses[drone], velocity[drone], live
@@ -119,17 +132,45 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
                 continue
         if node.digest_units > 0 and node.digest_parts > 0:
             said = _send_digests(
-                rules, now, drone, node, messages[drone], counters[drone], air.digests[world, drone], versions[drone]
+                rules, now, drone, node, messages[drone], counters[drone], air.digests[world, drone], versions[drone],
+                air.media[world, BUDGET],
             )  # fmt: skip
             if not said:
                 continue
-        # scans must not starve tiles: whichever of the two went short of bytes goes first the next time
-        if node.tiles_first:
-            if _send_tiles(air, world, tick, drone, layers, versions):
-                node.tiles_first = False
-                _send_scan(rules, now, node, messages[drone], counters[drone], air.windows[world, drone])
-        elif _send_scan(rules, now, node, messages[drone], counters[drone], air.windows[world, drone]):
-            node.tiles_first = node.wanted > 0 and not _send_tiles(air, world, tick, drone, layers, versions)
+        while True:  # by turns, as MeshNode._send_maps
+            if node.wanted > 0 and (node.pending_clock == 0 or _is_tiles_turn(node, air.wanted[world, drone, 0])):
+                if not _send_tiles(air, world, tick, drone, layers, versions):
+                    break
+                node.scans_ahead = 0
+            elif node.pending_clock != 0:
+                if not _send_scan(rules, now, node, messages[drone], counters[drone], air.windows[world, drone]):
+                    break
+                node.scans_ahead = node.scans_ahead + 1 if node.wanted > 0 else 1
+            else:
+                break
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_worth_telling(node, now, rules, clock, cells, versions, known, counters):  # type: ignore[no-untyped-def]
+    """Tell whether a scan shows enough that is new, or is long after the last, or stands for one that waits.
+
+    Counts the cells that own scans have made known by now: `cells` and `versions` are the own layer's.
+    """
+    for i in range(versions.shape[0]):
+        for j in range(versions.shape[1]):
+            if np.int64(versions[i, j]) > node.claimed_clock:
+                counters[OWN_SCAN] += claim(cells, known, i * TILE, TILE, j * TILE)
+    node.claimed_clock = np.int64(clock)
+    news = counters[OWN_SCAN] - node.told_cells
+    if node.pending_clock != 0 or news >= SCAN_NEWS_CELLS:
+        return True
+    return now >= node.next_scan - rules.scan_period + (FEW_NEWS_S if news > 0 else NO_NEWS_S) - _EPSILON_S
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_tiles_turn(node, head):  # type: ignore[no-untyped-def]
+    """Tell whether so many scans went ahead of the queue, whose first entry is `head`, that it has its turn."""
+    return node.scans_ahead >= (_SCANS_BEFORE_NEWS if brings_news(head) else _SCANS_BEFORE_REPEATS)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -186,7 +227,7 @@ def _units(tiles):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _send_digests(rules, now, drone, node, messages, counters, digests, versions):  # type: ignore[no-untyped-def]
+def _send_digests(rules, now, drone, node, messages, counters, digests, versions, budget):  # type: ignore[no-untyped-def]
     """Tell which tiles of others are held, in as many datagrams as that takes; a long digest goes on the next time.
 
     `versions` are those that the drone holds, `[source, tile rows, tile columns]`. False when bytes run short.
@@ -221,6 +262,9 @@ def _send_digests(rules, now, drone, node, messages, counters, digests, versions
                 for tile in range(tiles):
                     copy[source, tile] = versions[source, tile // tile_columns, tile % tile_columns]
             node.digests += 1
+        node.digest_bytes += size
+        spread = node.digest_bytes / (_DIGEST_SHARE * budget)
+        node.next_digest = max(node.next_digest, node.digest_at + min(_MOST_DIGEST_S, spread))
         node.digest_units -= last - first
         node.digest_parts -= 1
         node.digest_unit = last % (sources * units)
@@ -229,9 +273,7 @@ def _send_digests(rules, now, drone, node, messages, counters, digests, versions
 
 @numba.njit(cache=True, nogil=True)
 def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[no-untyped-def]
-    """Send the scan that waits, if any; False when bytes run short."""
-    if node.pending_clock == 0:
-        return True
+    """Send the scan that waits; False when bytes run short."""
     if not _can_send(node, messages, node.pending_bytes):
         return False
     place = _transmit(rules, now, node, messages, counters, SCAN, node.pending_bytes)
@@ -242,54 +284,55 @@ def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[n
         node.scans += 1
     node.scan_clock, node.pending_clock, node.pending_slot = node.pending_clock, 0, -1
     node.next_scan = now + rules.scan_period
+    node.told_cells = counters[OWN_SCAN]
     return True
 
 
 @numba.njit(cache=True, nogil=True)
 def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-untyped-def]
-    """Send the queue, a datagram of one source's tiles at a time; False when bytes or rings run short."""
+    """Send the head of the queue: one datagram of one source's tiles; False when bytes or rings run short."""
     node, wanted = air.nodes[world, drone], air.wanted[world, drone]
     messages, counters = air.messages[world, drone], air.counters[world, drone]
     tile_columns, slots = versions.shape[3], air.tile_cells.shape[2]
     now = tick / air.rules.ticks_per_s
-    while node.wanted > 0:
-        source, _, _ = source_and_tile(wanted[0])
-        cells = layers[drone, source] if source == drone else air.confirmed[world, drone, source]
-        held, notes = versions[drone, source], air.notes[world, drone, source]
-        reserved, size, count = _RESERVED_TILES, 0, 0
-        for entry in range(node.wanted):
-            its_source, row, column = source_and_tile(wanted[entry])
-            if its_source != source:
-                continue
-            note = notes[row * tile_columns + column]
-            if note.cost_version != held[row, column]:
-                note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), held[row, column]
-            reserved += note.cost + _RESERVED_TILE
-            if reserved > _MAX_PAYLOAD or count == _MOST_TILES or node.tiles + count == slots:
-                break
-            size += tile_in_message_bytes(np.int64(note.cost), np.int64(note.cost_version))
-            count += 1
-        size += tiles_message_bytes(count)
-        if count == 0 or not _can_send(node, messages, size):
-            return False
-        place = _transmit(air.rules, now, node, messages, counters, TILES, size)
-        left = taken = 0
-        for entry in range(node.wanted):
-            its_source, row, column = source_and_tile(wanted[entry])
-            if taken == count or its_source != source:
-                wanted[left] = wanted[entry]
-                left += 1
-                continue
-            tile = row * tile_columns + column
-            if place >= 0:
-                slot = (node.first_tile + node.tiles + taken) % slots
-                air.tile_keys[world, drone, slot, 0] = tile
-                air.tile_keys[world, drone, slot, 1] = held[row, column]
-                copy_tile(cells, row * TILE, column * TILE, air.tile_cells[world, drone, slot], 0, 0)
-            notes[tile].sent_version, notes[tile].sent_tick = held[row, column], tick
-            taken += 1
-        node.wanted = left
+    source, _, _ = source_and_tile(wanted[0])
+    cells = layers[drone, source] if source == drone else air.confirmed[world, drone, source]
+    held, notes = versions[drone, source], air.notes[world, drone, source]
+    reserved, size, count = _RESERVED_TILES, 0, 0
+    for entry in range(node.wanted):
+        its_source, row, column = source_and_tile(wanted[entry])
+        if its_source != source:
+            continue
+        note = notes[row * tile_columns + column]
+        if note.cost_version != held[row, column]:
+            note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), held[row, column]
+        reserved += note.cost + _RESERVED_TILE
+        if reserved > _MAX_PAYLOAD or count == _MOST_TILES or node.tiles + count == slots:
+            break
+        size += tile_in_message_bytes(np.int64(note.cost), np.int64(note.cost_version))
+        count += 1
+    size += tiles_message_bytes(count)
+    if count == 0 or not _can_send(node, messages, size):
+        return False
+    place = _transmit(air.rules, now, node, messages, counters, TILES, size)
+    left = taken = 0
+    for entry in range(node.wanted):
+        its_source, row, column = source_and_tile(wanted[entry])
+        if taken == count or its_source != source:
+            wanted[left] = wanted[entry]
+            left += 1
+            continue
+        tile = row * tile_columns + column
         if place >= 0:
-            messages[place].source, messages[place].count = source, count
-            node.tiles += count
+            slot = (node.first_tile + node.tiles + taken) % slots
+            air.tile_keys[world, drone, slot, 0] = tile
+            air.tile_keys[world, drone, slot, 1] = held[row, column]
+            copy_tile(cells, row * TILE, column * TILE, air.tile_cells[world, drone, slot], 0, 0)
+        notes[tile].sent_version, notes[tile].sent_tick = held[row, column], tick
+        notes[tile].sent_known = known_cells(layers[drone, source], row * TILE, column * TILE)
+        taken += 1
+    node.wanted = left
+    if place >= 0:
+        messages[place].source, messages[place].count = source, count
+        node.tiles += count
     return True

@@ -26,6 +26,8 @@ from imagine.sim.radio import RadioMedium, RadioSettings
 from imagine.sim.twin import TICK_S, Twin
 
 RANGE_CAP_M = 4.0
+BOOT = 200_000_000
+"""A boot number as flown ones are, seconds since 2020, and as many bytes on the wire."""
 _KEY = bytes(KEY_BYTES)  # of no mission: nothing of these flights leaves the process
 
 
@@ -76,7 +78,7 @@ class MeshFlight:
         self.radio = RadioMedium(self.drones, self.radio_settings, rng, self.level.segments)
         self.maps = [EvidenceMap(number) for number in range(1, self.drones + 1)]
         self.nodes = [
-            MeshNode(evidence, self.lidar, RANGE_CAP_M, self.mesh_settings, Sealer(_KEY, evidence.own, 1))
+            MeshNode(evidence, self.lidar, RANGE_CAP_M, self.mesh_settings, Sealer(_KEY, evidence.own, BOOT))
             for evidence in self.maps
         ]
         self._reader = Sealer(_KEY, 254, 1)

@@ -9,11 +9,12 @@ from imagine.core.evidence import TileKey
 from imagine.core.frames import Pose
 from imagine.core.raster import TILE
 from imagine.mesh_comm.codec import pack_tile
-from imagine.mesh_comm.digest import digests
+from imagine.mesh_comm.digest import Held, digests
 from imagine.mesh_comm.messages import MAX_DATAGRAM, Tile, Tiles
 from imagine.mesh_comm.seal import OVERHEAD
 from imagine.sim.air_receive import is_live
 from imagine.sim.exploration import Exploration
+from imagine.sim.mesh_flight import BOOT
 from imagine.sim.plain.maps import PlainMaps
 from imagine.sim.plain.mesh import PlainMesh, exploring
 
@@ -63,7 +64,7 @@ def hand_over_mesh(batch: Exploration, world: int, maps: PlainMaps, mesh: PlainM
         mesh.tell(sender, receiver, exploring(sender + 1, at, pose, velocity, heard), at)
         if peer["digest_tick"] >= 0 and is_live(peer, int(batch.ticks[world]), air.rules):
             held = {
-                source + 1: _listed(air.holdings[world, receiver, sender, source], batch, maps)
+                source + 1: Held(BOOT, _listed(air.holdings[world, receiver, sender, source], batch, maps))
                 for source in range(batch.drones)
                 if source != sender
             }
@@ -92,4 +93,4 @@ def _confirmed(batch: Exploration, world: int, holder: int, source: int, maps: P
         )
         for row, column in np.argwhere(held > 0).tolist()
     ]  # fmt: skip
-    return [Tiles(source + 1, tiles[k : k + _TILES_A_MESSAGE]) for k in range(0, len(tiles), _TILES_A_MESSAGE)]
+    return [Tiles(source + 1, tiles[k : k + _TILES_A_MESSAGE], BOOT) for k in range(0, len(tiles), _TILES_A_MESSAGE)]

@@ -14,6 +14,7 @@ from imagine.mesh_comm.messages import GROUND, Message, Status, encode
 from imagine.mesh_comm.node import MeshNode
 from imagine.mesh_comm.seal import KEY_BYTES, Sealer
 from imagine.mesh_comm.settings import MeshSettings
+from imagine.sim.mesh_flight import BOOT
 from imagine.sim.radio import RadioMedium, RadioSettings
 
 _KEY = bytes(KEY_BYTES)  # of no mission: no datagram leaves the process
@@ -34,7 +35,7 @@ class PlainMesh:
         rng: np.random.Generator,
     ) -> None:
         """Start with nobody heard; `walls` `[n, 4]` are faces, metres, and `rng` draws what the radio loses."""
-        self._sealers = [Sealer(_KEY, evidence.own, 1) for evidence in maps]
+        self._sealers = [Sealer(_KEY, evidence.own, BOOT) for evidence in maps]
         self.nodes = [
             MeshNode(evidence, lidar, range_cap_m, mesh, sealer)
             for evidence, sealer in zip(maps, self._sealers, strict=True)

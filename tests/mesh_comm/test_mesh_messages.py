@@ -13,7 +13,7 @@ from imagine.core.evidence import TileKey
 from imagine.core.frames import Pose
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.codec import unpack_versions
-from imagine.mesh_comm.digest import digests
+from imagine.mesh_comm.digest import Held, digests
 from imagine.mesh_comm.messages import (
     WIRE_VERSION,
     Command,
@@ -156,14 +156,20 @@ versions = st.dictionaries(tile_keys, st.integers(1, 2**31), max_size=300)
 
 
 @settings(max_examples=50)
-@given(st.dictionaries(st.integers(1, 9), versions, max_size=4), st.integers(250, 1170))
-def test_digests_tell_all_versions_within_their_size(held: dict[int, dict[TileKey, int]], max_bytes: int) -> None:
+@given(
+    st.dictionaries(st.integers(1, 9), st.tuples(st.integers(0, 2**32 - 1), versions), max_size=4),
+    st.integers(250, 1170),
+)
+def test_digests_tell_all_versions_within_their_size(
+    held: dict[int, tuple[int, dict[TileKey, int]]], max_bytes: int
+) -> None:
     told: dict[int, dict[TileKey, int]] = {source: {} for source in held}
-    for digest in digests(1.0, held, max_bytes):
+    for digest in digests(1.0, {source: Held(*of) for source, of in held.items()}, max_bytes):
         assert len(encode(digest)) <= max_bytes
         for holding in digest.holdings:
             part = unpack_versions(holding.packed)
             assert all(holding.after is None or key > holding.after for key in part)
             assert all(holding.until is None or key <= holding.until for key in part)
+            assert holding.boot == held[holding.source][0]
             told[holding.source].update(part)
-    assert told == held
+    assert told == {source: of[1] for source, of in held.items()}

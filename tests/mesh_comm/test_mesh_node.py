@@ -392,12 +392,15 @@ def test_a_restarted_drone_is_heard_again_and_its_map_replaces_the_old_one() -> 
         a.fly(Pose(1.0, 0.0, float(now)), float(now))
         exchange([a, b], np.array([now]))
     exchange([a, b], ticks(2.0, 2.0))
-    old = max(b.evidence.versions(1).values())
+    old = b.evidence.versions(1)
     again = make_drone(1, boot=2)
-    again.fly(Pose(1.0, 0.0, 0.0), 4.0)
+    again.fly(Pose(-2.0, 0.0, 0.0), 4.0)
     exchange([again, b], ticks(4.0, 4.0))
     held = b.evidence.versions(1)
-    assert all(held[key] == version > old for key, version in again.evidence.versions(1).items())
+    assert same_layers([again, b])
+    assert b.evidence.layers[1].boot == 2
+    assert max(held.values()) < max(old.values())  # versions begin anew: the boot number is their high part
+    assert old.keys() - held.keys()  # and what only the earlier life saw is gone
     for _, recording in a.sent:
         b.node.receive(recording, 9.0)
     assert b.evidence.versions(1) == held
@@ -454,15 +457,15 @@ def payloads() -> list[bytes]:
     sender.fly(Pose(0.5, 0.0, 0.0), 0.0)
     key, version = next(iter(sender.evidence.versions(1).items()))
     cells = pack_tile(sender.evidence.tile(1, key))
-    from imagine.mesh_comm.digest import digests
+    from imagine.mesh_comm.digest import Held, digests
     from imagine.mesh_comm.scan_exchange import scan_message
 
     scan = scan_message(1, 1, Pose(0.5, 0.0, 0.0), room_scan(Pose(0.5, 0.0, 0.0), 0.0), LIDAR, CAP_M, 1170)
     made: list[messages.Message] = [
         scan,
-        Tiles(1, [Tile(key.column, key.row, version, cells)]),
+        Tiles(1, [Tile(key.column, key.row, version, cells)], boot=1),
         Tiles(3, [Tile(key.column, key.row, version, cells)]),
-        *digests(0.0, {2: sender.evidence.versions(1), 3: {}}, 1170),
+        *digests(0.0, {2: Held(1, sender.evidence.versions(1)), 3: Held(1, {})}, 1170),
         Digest(0.0, []),
         Status(1, 0.0, Pose(0.5, 0.0, 0.0), reason="none", links={3: 0.5}),
         messages.Command("land", 2, 3),
@@ -481,7 +484,7 @@ def test_a_tile_far_outside_is_refused_and_memory_stays_bounded() -> None:
     shape = drone.evidence.shape
     cells = pack_tile(np.ones((32, 32), np.int8))
     for column, row in ((160, 0), (-160, 0), (0, 160), (160, -160)):
-        drone.node.receive(_FORGER.seal(messages.encode(Tiles(1, [Tile(column, row, 1, cells)])), 0.0), 0.0)
+        drone.node.receive(_FORGER.seal(messages.encode(Tiles(1, [Tile(column, row, 1, cells)], boot=1)), 0.0), 0.0)
     assert drone.evidence.shape == shape
     assert drone.node.stats["content"] == 4
     for source in range(3, 250):
@@ -492,9 +495,9 @@ def test_a_tile_far_outside_is_refused_and_memory_stays_bounded() -> None:
 @pytest.mark.parametrize(
     "tiles",
     [
-        Tiles(1, [Tile(0, 0, 1, b"\xff" * 900)]),
-        Tiles(2, [Tile(0, 0, 2**31, b"\xff" * 900)]),  # the listener's own
-        Tiles(1, [Tile(160, 0, 1, pack_tile(np.ones((32, 32), np.int8)))]),
+        Tiles(1, [Tile(0, 0, 1, b"\xff" * 900)], boot=1),
+        Tiles(2, [Tile(0, 0, 2**31, b"\xff" * 900)], boot=1),  # the listener's own
+        Tiles(1, [Tile(160, 0, 1, pack_tile(np.ones((32, 32), np.int8)))], boot=1),
         Tiles(200, [Tile(0, 0, 1, pack_tile(np.ones((32, 32), np.int8)))]),  # one source too many
     ],
     ids=["damaged", "own damaged", "far away", "too many sources"],
@@ -505,7 +508,7 @@ def test_nothing_is_noted_of_tiles_that_are_refused(tiles: Tiles) -> None:
     for source in (3, 4) if tiles.source == 1 else (3, 4, 5):
         drone.node.receive(_FORGER.seal(messages.encode(Tiles(source, [Tile(0, 0, 1, cells)])), 0.0), 0.0)
     record, noted = drone.node._peers.live(0.0)[0], len(drone.node._exchange._sent)
-    before = {source: dict(held) for source, held in record.holdings.items()}
+    before = dict(record.holdings)
     drone.node.receive(_FORGER.seal(messages.encode(tiles), 0.1), 0.1)
     assert drone.node.stats["content"] == 1
     assert record.holdings == before

@@ -204,7 +204,7 @@ class TeamOnBoard:
         if record["kind"] == TILES:
             source = int(record["source"]) + 1
             self.relayed += source != own.id
-            return messages.Tiles(source, [self._tile(source, place, version) for place, version in told])
+            return messages.Tiles(source, [self._tile(source, place, version) for place, version in told], 1)
         if record["kind"] == DIGEST:  # what it tells decides only what is sent, and that is the batch's affair here
             return messages.Digest(now, [])
         assert record["kind"] == STATUS

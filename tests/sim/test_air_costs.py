@@ -14,6 +14,7 @@ from imagine.sim.air_costs import (
     TILE_WEIGHTS,
     VERSIONS_WEIGHTS,
     digest_message_bytes,
+    int_bytes,
     packed_ranges_bytes,
     packed_tile_bytes,
     scan_message_bytes,
@@ -51,6 +52,7 @@ def test_framing_is_counted_to_the_byte(said: list[Said]) -> None:
                 cells = (message.own_cells, message.scan_cells, message.map_cells)
                 counters = np.array([*message.bytes_sent.values(), *cells])
                 expected = status_bytes(counters, len(message.links))
+                expected += sum(map(int_bytes, message.taught.values())) - 2 * 3  # said to take three bytes each
             case _:
                 pytest.fail(f"a drone said {message}")
         assert item.sealed_bytes == expected
