@@ -63,12 +63,17 @@ class Observation:
 
 @dataclass(frozen=True)
 class Step:
-    """What a decision brings: the next observation, reward `[worlds, drones]`, which worlds ended, their metrics."""
+    """What a decision brings: the next observation, reward `[worlds, drones]`, which worlds ended, their metrics.
+
+    `late` bool `[worlds]` tells which episodes ended with this decision by their time limit alone: neither was enough
+    covered, nor anything left to go to, nor anybody left to go there.
+    """
 
     observation: Observation
     reward: NDArray[np.float32]
     done: NDArray[np.bool_]
     episodes: list[EpisodeMetrics]
+    late: NDArray[np.bool_]
 
 
 class Exploration:
@@ -193,10 +198,10 @@ class Exploration:
         self.decisions.decide(wanted, self.estimates)
         self._now = 1 - self._now
         reward = np.zeros((self.worlds, self.drones), np.float32)
-        running = ~self._episodes.ended
+        running, late = ~self._episodes.ended, np.zeros(self.worlds, np.bool_)
         ticks = self.settings.action.decision_ticks
         for tick in range(ticks):  # a world that ends waits for the others' decisions to end
-            reward += self._tick(running, tick == ticks - 1)
+            reward += self._tick(running, late, tick == ticks - 1)
         done = ~running
         episodes = [self._metrics(int(world)) for world in np.flatnonzero(done & ~self._episodes.ended)]
         self._episodes.ended |= done
@@ -205,7 +210,7 @@ class Exploration:
                 self._restart(int(world))
             launching = np.where(done, LAUNCHING, WAITING)
             self._run(launching, launching)  # what they see at their launch is nobody's gain
-        return Step(self.observation(), reward, done, episodes)
+        return Step(self.observation(), reward, done, episodes, late)
 
     def _check(self, actions: NDArray[np.float32]) -> None:
         expected = (self.worlds, self.drones, self.settings.action.size)
@@ -219,8 +224,11 @@ class Exploration:
                 f"at ({x:.2f}, {y:.2f}), is not finite"
             )
 
-    def _tick(self, running: NDArray[np.bool_], observes: bool) -> NDArray[np.float32]:
-        """Fly one tick in the `running` worlds, clear the flag of those that end with it, return what was earned."""
+    def _tick(self, running: NDArray[np.bool_], late: NDArray[np.bool_], observes: bool) -> NDArray[np.float32]:
+        """Fly one tick in the `running` worlds and return what was earned; clear the flag of those that end with it.
+
+        Of these, `late` is set where only the time limit ended them.
+        """
         flying = self.alive & running[:, None]
         shown = np.full(self.worlds, FLYING if observes else WAITING)  # also those that ended before the others
         begun, coverage = self._advance(running, shown)
@@ -229,8 +237,10 @@ class Exploration:
         earned = rewards(gained, begun, flying, self.maps.coverable_cells, self.settings.reward, self._swept, completed)
         idle, sees = self._episodes.idle, self.maps.arrays.frontiers.any(axis=1)
         idle[...] = np.where(running, np.where(sees, 0, idle + 1), idle)
-        over = completed | (self.ticks >= self._episodes.limit) | (idle >= _IDLE_TICKS) | ~self.alive.any(axis=1)
-        running &= ~over
+        over = completed | (idle >= _IDLE_TICKS) | ~self.alive.any(axis=1)
+        timed_out = self.ticks >= self._episodes.limit
+        late |= running & timed_out & ~over
+        running &= ~(over | timed_out)
         return earned
 
     def _advance(
