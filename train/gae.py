@@ -22,9 +22,9 @@ def advantages_and_returns(
     with another, reach no other step and are to be left out. `last_values` `[agents]` are the values of the state
     after the last step.
 
-    `truncated` `[steps, agents]` tells which episodes the clock ended: a drone cannot see the clock, so what it would
-    still have earned counts (Pardo et al. 2018). The state after such a step was never looked at; it is valued as the
-    state before it, a tick away.
+    `truncated` `[steps, agents]` tells which episodes the time limit cut off: a drone cannot see the clock, so what it
+    would still have earned counts (Pardo et al. 2018); after all other ends nothing does. The state after such a step
+    was never looked at; it is valued as the state before it, a decision away.
     """
     advantages = torch.empty_like(rewards)
     following = torch.zeros_like(last_values)

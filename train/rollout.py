@@ -61,9 +61,9 @@ class Rollout:
     """Steps of all drones of all worlds; tensors `[steps, agents, ...]`, agents = worlds x drones, in that order.
 
     `alive` tells which drones acted: what a dead one is said to have done counts for nothing. `dones[t]` tells that a
-    drone's own episode ended with step t, by its death or with the world's, and `truncated[t]` that the clock ended it
-    while it still flew. `last` holds the observation after the last step, `[agents, ...]`, and `recall` what was
-    remembered then; `level` images are the critic's own (and a centralised actor's); `env_s` is the time the
+    drone's own episode ended with step t, by its death or with the world's, and `truncated[t]` that only the time limit
+    ended it, while it still flew (`cut_off`). `last` holds the observation after the last step, `[agents, ...]`, and
+    `recall` what was remembered then; `level` images are the critic's own (and a centralised actor's); `env_s` is the time the
     environment took. Images are kept in half precision, channels last: they are what costs memory, and the policy acts
     by them as they are kept.
 
@@ -234,7 +234,7 @@ def _collect(
         died = flying & ~env.alive  # a world that starts anew has everyone alive again
         rewards[t] = torch.from_numpy(step.reward.reshape(-1))
         dones[t] = torch.from_numpy((ended | died).reshape(-1))
-        truncated[t] = torch.from_numpy((flying & late_worlds(step, env)[:, None]).reshape(-1))
+        truncated[t] = torch.from_numpy((flying & cut_off(step)).reshape(-1))
         recall.starts = torch.from_numpy(ended.reshape(-1).copy()).to(device)
         episodes.extend(step.episodes)
         observation = step.observation
@@ -255,13 +255,16 @@ def next_decisions(actor: Actor, seen: Seen, recall: Recall, drones: int) -> Dec
     return decisions
 
 
-def late_worlds(step: Step, env: Exploration) -> NDArray[np.bool_]:
-    """Tell which worlds the clock ended, bool `[worlds]`: neither was all covered nor had the last drone fallen."""
-    late = np.zeros(env.worlds, bool)
+def cut_off(step: Step) -> NDArray[np.bool_]:
+    """Tell whose episode the time limit cut off, bool `[worlds, drones]`.
+
+    Any other end is the end: a level covered, no frontier left, everyone down, or the drone's own death, even where the
+    limit comes with the same step. Only what the limit cut off would have gone on to earn (Pardo et al. 2018).
+    """
+    cut = np.zeros(step.reward.shape, np.bool_)
     for episode in step.episodes:
-        fell = (episode.alive_ticks < episode.ticks).all()
-        late[episode.world] = episode.coverage < env.settings.stop_coverage and not fell
-    return late
+        cut[episode.world] = step.late[episode.world] & (episode.alive_ticks == episode.ticks)
+    return cut
 
 
 def env_actions(actions: Tensor, env: Exploration) -> NDArray[np.float32]:
