@@ -1,7 +1,7 @@
 """The folder of a run: its configuration, what it ran on, its metrics and its checkpoints.
 
-runs/NAME/config.yaml      the settings, complete
-runs/NAME/record.json      seed, versions, machine, command, git state; what it was resumed with
+runs/NAME/config.yaml      the settings, complete, as they are now
+runs/NAME/record.json      seed, versions, machine, command, git state; with what it was resumed, and what that changed
 runs/NAME/changes.patch    what the code had that its commit has not, where it differed
 runs/NAME/metrics.jsonl    one line an update
 runs/NAME/tensorboard/     the same for TensorBoard
@@ -12,6 +12,7 @@ runs/NAME/checkpoints/     latest.pt, the newest few by step, imitated.pt, final
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,15 @@ from imagine.core.errors import InputError
 from imagine.train.atomic_file import write_atomically
 from imagine.train.checkpoint import Checkpoint, save_checkpoint
 from imagine.train.run_record import config_hash, git_commit, run_record, session_record
-from imagine.train.settings import TrainSettings
+from imagine.train.settings import TrainSettings, load_train_settings
 from imagine.train.tracking.code_state import own_code_state
 from imagine.train.tracking.json_lines import drop_after
 from imagine.train.tracking.open import check_tracking, open_trackers
 from imagine.train.tracking.tracker import Tracker
 
 __all__ = ["RunFolder", "config_hash", "git_commit", "run_record"]
+
+logger = logging.getLogger(__name__)
 
 
 class RunFolder:
@@ -61,8 +64,9 @@ class RunFolder:
     def reopen(path: Path, agent_steps: int, settings: TrainSettings) -> RunFolder:
         """Open a run's folder to go on after `agent_steps`; metrics from after that point are dropped.
 
-        The record takes down with which code and settings the run goes on. Raises InputError when a tracker cannot be
-        had, WorkError on a full disk.
+        From now on `settings` are the run's, and are what it is resumed with the next time. The record takes down with
+        which code the run goes on, and as `changed` which settings were others before: `[before, now]` by key. Raises
+        InputError when a tracker cannot be had, WorkError on a full disk.
         """
         check_tracking(settings.tracking)
         for half_written in (path / "checkpoints").glob(".*.tmp"):  # by a process that was killed
@@ -71,8 +75,14 @@ class RunFolder:
         record = _read_record(path / "record.json")
         session = {"agent_steps": agent_steps, **run_record(settings), **session_record()}
         session["changes"] = _keep_changes(path / f"changes-{agent_steps}.patch")
+        config = settings.model_dump(mode="json")
+        before = load_train_settings(path / "config.yaml").model_dump(mode="json")
+        session["changed"] = _differences(before, config)
         record.setdefault("resumed", []).append(session)
         _write(path / "record.json", json.dumps(record, indent=2) + "\n")
+        if session["changed"]:
+            _write(path / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+            logger.info("%s: keeps what was changed: %s", path / "config.yaml", ", ".join(session["changed"]))
         return RunFolder(path, open_trackers(settings.tracking, path, settings.run.name, agent_steps))
 
     def log(self, step: int, scalars: Mapping[str, float]) -> None:
@@ -102,6 +112,18 @@ class RunFolder:
 
 def _write(path: Path, text: str) -> None:
     write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any], at: str = "") -> dict[str, list[Any]]:
+    """Return `[before, now]` of every setting that differs, by its key; a mapping that came or went as one."""
+    found: dict[str, list[Any]] = {}
+    for key in dict.fromkeys((*before, *now)):
+        old, new = before.get(key), now.get(key)
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            found |= _differences(old, new, f"{at}{key}.")
+        elif old != new:
+            found[f"{at}{key}"] = [old, new]
+    return found
 
 
 def _keep_changes(path: Path) -> str | None:

@@ -102,9 +102,28 @@ def test_what_a_run_is_resumed_with_is_taken_down(tmp_path):
     [resumed] = record["resumed"]
     assert resumed["agent_steps"] == 20
     assert resumed["config_sha256"] == config_hash(longer) != config_hash(settings)
+    assert resumed["changed"] == {"ppo.agent_steps": [settings.ppo.agent_steps, 7]}
     rows = [json.loads(line) for line in (folder.path / "metrics.jsonl").read_text().splitlines()]
     assert [row["agent_steps"] for row in rows] == [10, 20, 25]
     assert not list(folder.checkpoints.iterdir())
+
+
+def test_what_a_run_is_resumed_with_stays_at_the_next_resumption(tmp_path, caplog):
+    settings = load_train_settings(None, (f"run.root={tmp_path}", "run.name=mine"))
+    folder = RunFolder.create(settings)
+    folder.close()
+    caplog.set_level("INFO")
+    for override in ("ppo.agent_steps=7", "ppo.clip=0.3"):
+        RunFolder.reopen(folder.path, 0, load_train_settings(folder.path / "config.yaml", (override,))).close()
+    kept = load_train_settings(folder.path / "config.yaml")
+    assert (kept.ppo.agent_steps, kept.ppo.clip) == (7, 0.3)
+    assert kept.model_copy(update={"ppo": settings.ppo}) == settings
+    RunFolder.reopen(folder.path, 0, kept).close()
+    resumed = json.loads((folder.path / "record.json").read_text())["resumed"]
+    assert [session["changed"] for session in resumed] == [
+        {"ppo.agent_steps": [settings.ppo.agent_steps, 7]}, {"ppo.clip": [settings.ppo.clip, 0.3]}, {},
+    ]  # fmt: skip
+    assert "keeps what was changed: ppo.clip" in caplog.text
 
 
 def test_a_damaged_record_is_named(tmp_path):
