@@ -31,6 +31,7 @@ from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
 from imagine.train.rollout import Recall
 from imagine.train.rollout_source import OwnRollouts, RolloutSource
 from imagine.train.run_folder import RunFolder, run_record
+from imagine.train.run_lock import locked
 from imagine.train.settings import TrainSettings, load_train_settings
 from imagine.train.stopping import stop_requests
 
@@ -63,22 +64,29 @@ def train(
     """Run a training from a configuration, or go on with the run in the folder `resume`.
 
     SIGINT and SIGTERM end it cleanly after the update in progress, with a checkpoint. Raises InputError for bad
-    settings or checkpoints, WorkError when training diverges or the disk is full.
+    settings or checkpoints and where another process trains in the folder, WorkError when training diverges or the disk
+    is full.
     """
     if resume is None:
         settings = load_train_settings(config, overrides)
         trainer = Trainer(settings)
-        folder = RunFolder.create(settings)
-    else:
-        if config is not None:
-            raise InputError("a resumed run has its configuration already: give CONFIG or --resume, not both")
-        run = resume if resume.is_dir() else resume.parent.parent
-        if not (resume.exists() and (run / "config.yaml").exists()):
-            raise InputError(f"--resume {resume}: no run to go on with: give a run's folder, or a checkpoint in one")
+        with locked(Path(settings.run.root) / settings.run.name):
+            return _run(trainer, RunFolder.create(settings), report)
+    if config is not None:
+        raise InputError("a resumed run has its configuration already: give CONFIG or --resume, not both")
+    run = resume if resume.is_dir() else resume.parent.parent
+    if not (resume.exists() and (run / "config.yaml").exists()):
+        raise InputError(f"--resume {resume}: no run to go on with: give a run's folder, or a checkpoint in one")
+    with locked(run):  # before the checkpoint is read: whoever trained here until now may have left a newer one
         settings = load_train_settings(run / "config.yaml", overrides)
         checkpoint = None if _is_before_its_first_checkpoint(resume) else load_checkpoint(resume)
         trainer = Trainer(settings, checkpoint)
-        folder = RunFolder.reopen(run, 0 if checkpoint is None else sum(checkpoint.agent_steps.values()), settings)
+        steps = 0 if checkpoint is None else sum(checkpoint.agent_steps.values())
+        return _run(trainer, RunFolder.reopen(run, steps, settings), report)
+
+
+def _run(trainer: Trainer, folder: RunFolder, report: Reporter | None) -> RunResult:
+    """Train until the end, or until the process is told to stop."""
     try:
         with stop_requests() as stop:
             return trainer.run(folder, report or LogReporter(), stop)
