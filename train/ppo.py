@@ -130,8 +130,10 @@ class _Update:
             "return": float(targets.mean()),
             "return_std": float(targets.std()),
             "value": float(values[lived].mean()),
+        # what is drawn by the head `choice` are numbers of frontiers, which have no size
+        size = {} if self.actor.choice else {"action_abs": float(rollout.actions.flatten(0, 1)[lived].abs().mean())}
             "advantage_std": float(counted.std()),
-            "action_abs": float(rollout.actions.flatten(0, 1)[lived].abs().mean()),
+            **size,
         }
 
     def _teach_critic(self, cut: Cut, pieces: list[Tensor]) -> list[Record]:
@@ -221,11 +223,13 @@ class _Update:
         return length
 
     def _spread_numbers(self) -> Record:
-        spread = self.actor.spread().detach()
-        std = spread.exp().tolist()
+        """Return how far actions are drawn from their means, where actions are drawn; and what was scheduled."""
+        numbers = {}
+        if self.actor.choice is None:
+            std = self.actor.spread().detach().exp().tolist()
+            numbers = {f"action_std_{i}": value for i, value in enumerate(std)} | {"action_std": sum(std) / len(std)}
         return {
-            **{f"action_std_{i}": value for i, value in enumerate(std)},
-            "action_std": sum(std) / len(std),
+            **numbers,
             "entropy_weight": self.entropy_weight,
             "actor_lr": self.optimisers.actor.param_groups[0]["lr"],
             "critic_lr": self.optimisers.critic.param_groups[0]["lr"],

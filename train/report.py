@@ -162,12 +162,17 @@ def _tables(report: Report) -> Iterator[Table]:
         if len(everywhere) > _MOST_LEVELS:  # the worst are those one must know of
             everywhere = sorted(everywhere, key=lambda item: item[1]["coverage"])[:_MOST_LEVELS]
         for level, row in everywhere:
-            levels.add_row(level, f"{row['coverage']:.3f}", f"{row['t90']:.0f}", f"{row['contacts']:.1f}")
+            levels.add_row(level, f"{row['coverage']:.3f}", _time(row), f"{row['contacts']:.1f}")
         hidden = len(report.levels) - len(everywhere)
         row = report.overall
         name = f"all, {hidden} better not shown" if hidden else "all"
-        levels.add_row(name, f"{row['coverage']:.3f}", f"{row['t90']:.0f}", f"{row['contacts']:.1f}", style="bold")
+        levels.add_row(name, f"{row['coverage']:.3f}", _time(row), f"{row['contacts']:.1f}", style="bold")
         yield levels
+
+
+def _time(numbers: dict[str, float]) -> str:
+    """Return the ticks to 90 %, `-` where episodes end before that."""
+    return f"{numbers['t90']:.0f}" if "t90" in numbers else "-"
 
 
 def _first_numbers(numbers: dict[str, float]) -> list[tuple[str, float]]:
@@ -178,7 +183,7 @@ def _first_numbers(numbers: dict[str, float]) -> list[tuple[str, float]]:
 
 def one_line(report: Report) -> str:
     """Return a report as one line of text."""
-    levels = " ".join(f"{level}:{n['coverage']:.2f}/{n['t90']:.0f}" for level, n in report.levels.items())
+    levels = " ".join(f"{level}:{n['coverage']:.2f}/{_time(n)}" for level, n in report.levels.items())
     numbers = " ".join(f"{name}={value:.3g}" for name, value in _first_numbers(report.numbers))
     return (
         f"{report.phase} {report.phase_steps}/{report.phase_total} {report.steps_per_s:.0f} steps/s "

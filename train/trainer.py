@@ -117,7 +117,8 @@ class Trainer:
         # Set here, whatever OMP_NUM_THREADS says: sums are split by thread, and equal settings must give equal runs.
         torch.set_num_threads(self.settings.run.threads or len(os.sched_getaffinity(0)))
         self.learner = Learner.create(self.settings)
-        self.episodes = RecentEpisodes(self.settings.env.episode_ticks, self.curriculum.levels)
+        env = self.settings.env
+        self.episodes = RecentEpisodes(env.episode_ticks, self.curriculum.levels, env.stop_coverage)
         self._began, self._wall_before_s = time.monotonic(), 0.0
         self._source: RolloutSource | None = None
         self._last: Checkpoint | None = None

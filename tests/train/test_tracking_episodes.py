@@ -8,6 +8,7 @@ import pytest
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.checkpoint import pack, unpack
+from imagine.train.report import Report, one_line
 from imagine.train.tracking.episodes import (
     DRONE_METRICS,
     RECENT_EPISODES,
@@ -112,3 +113,19 @@ def test_many_files_are_counted_as_one():
     assert LevelGroups(plans)("12") == "12"
     group = LevelGroups([*plans, "plans/more.json", "4", "house:3"])
     assert [group(name) for name in ("12", "plans/more.json", "4", "house:9")] == ["files", "files", "4", "house"]
+
+
+@pytest.mark.parametrize(
+    ("stop", "missing"),
+    [(0.995, set()), (0.92, {"t95", "t99"}), (0.5, {"t90", "t90_reached", "t95", "t99"})],
+)
+def test_times_to_coverages_at_which_no_episode_arrives_are_left_out(episodes, stop, missing):
+    """They are not measured: the full length would say that the policy never gets there."""
+    recent = RecentEpisodes(TICKS, stop_coverage=stop)
+    recent.add(replace(episode, coverage=stop, t90=None if stop < 0.9 else 20) for episode in episodes)
+    means = recent.means()["1"]
+    assert set(TEAM_METRICS) - means.keys() == missing
+    assert recent.summary()["1"].keys() == {"coverage", "t90", "contacts"} - missing
+    report = Report("ppo", 1, 1, 2, {}, recent.means(), 1.0, {"update": 1.0}, 1.0)
+    assert missing.isdisjoint(name.rpartition("/")[2] for name in report.scalars())
+    assert f"1:{stop:.2f}/{'-' if stop < 0.9 else 20}" in one_line(report)

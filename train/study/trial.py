@@ -173,7 +173,10 @@ class _TuneReporter:
 
     def __call__(self, report: Report) -> None:
         """Take one report. Tune ends the thread in here (SystemExit) when it stops the trial."""
-        levels = {level: {name: numbers[name] for name in METRICS} for level, numbers in report.levels.items()}
+        levels = {
+            level: {name: numbers[name] for name in METRICS if name in numbers}
+            for level, numbers in report.levels.items()
+        }
         told = Told(report.agent_steps, report.wall_s, levels)
         log_told(self._folder, told)
         self._tell(told)

@@ -47,9 +47,10 @@ def plot_run(run_folder: Path, png: Path) -> None:
     levels = levels_of(curves)
     _draw(coverage, x, {level: curves[f"episode/{level}/coverage"] for level in levels}, smooth=False)
     _finish(coverage, "coverage by level", legend=True)
-    _draw(t90, x, {level: curves[f"episode/{level}/t90"] for level in levels}, smooth=False)
-    middles = [np.nanmedian(curves[f"episode/{level}/t90"]) for level in levels]
-    if levels and np.isfinite(middles).any():
+    times = _named(curves, {f"episode/{level}/t90": level for level in levels})
+    _draw(t90, x, times, smooth=False)
+    middles = [np.nanmedian(values) for values in times.values()]
+    if middles and np.isfinite(middles).any():
         t90.set_ylim(0.0, 1.4 * np.nanmax(middles))  # whoever has just begun is far above, and hides what comes of it
     _finish(t90, "ticks to 90 % by level", legend=False)
     _draw(losses, x, _named(curves, {"imitation/loss": "imitation", "ppo/value_loss": "value"}))

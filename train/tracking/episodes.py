@@ -28,6 +28,8 @@ DRONE_METRICS = (
 )  # fmt: skip
 """What `drone_metrics` returns for each drone; docs/tracking.md says what each is."""
 _RATIO = TEAM_METRICS.index("productivity_ratio")
+_REACHED = {"t90": 0.90, "t90_reached": 0.90, "t95": 0.95, "t99": 0.99}
+"""The coverage up to which an episode must be flown for a metric to be measured."""
 Means = dict[str, dict[str, float]]
 
 
@@ -84,12 +86,14 @@ def drone_metrics(episode: EpisodeMetrics) -> NDArray[np.float64]:
 class RecentEpisodes:
     """The newest RECENT_EPISODES finished episodes of each group of levels, in rings that are never moved.
 
-    `levels` are those of the settings, see `LevelGroups`. State saved and loaded again gives the same means to the
-    last bit, so that a resumed run tells what an uninterrupted one would.
+    `levels` are those of the settings, see `LevelGroups`. Where episodes end at a `stop_coverage` below that of a
+    metric, nobody knows when it would have been reached, and the metric is left out of all means. State saved and
+    loaded again gives the same means to the last bit, so that a resumed run tells what an uninterrupted one would.
     """
 
-    def __init__(self, episode_ticks: int, levels: Iterable[str] = ()) -> None:
+    def __init__(self, episode_ticks: int, levels: Iterable[str] = (), stop_coverage: float = 1.0) -> None:
         self.episode_ticks = episode_ticks
+        self._measured = [name for name in TEAM_METRICS if _REACHED.get(name, 0.0) <= stop_coverage]
         self.group_of = LevelGroups(levels)
         self._teams: dict[str, NDArray[np.float64]] = {}
         self._drones: dict[str, NDArray[np.float64]] = {}
@@ -110,18 +114,19 @@ class RecentEpisodes:
             self._counts[group] += 1
 
     def means(self) -> Means:
-        """Return the mean of every team metric by group; of the productivity ratio the geometric one."""
+        """Return the mean of every team metric measured, by group; of the productivity ratio the geometric one."""
         means = {}
         for group in sorted(self._counts):
             kept = self._teams[group][: self._counts[group]]
             values = kept.mean(axis=0)
             values[_RATIO] = np.exp(np.log(kept[:, _RATIO]).mean())
-            means[group] = dict(zip(TEAM_METRICS, values.tolist(), strict=True))
+            told = dict(zip(TEAM_METRICS, values.tolist(), strict=True))
+            means[group] = {name: told[name] for name in self._measured}
         return means
 
     def summary(self) -> Means:
         """Return of `means` what says most: for records that travel with checkpoints and exported policies."""
-        names = ("coverage", "t90", "contacts")
+        names = [name for name in ("coverage", "t90", "contacts") if name in self._measured]
         return {group: {name: means[name] for name in names} for group, means in self.means().items()}
 
     def drone_means(self) -> Means:
