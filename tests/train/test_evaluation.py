@@ -75,7 +75,7 @@ def episode(coverage=0.5, t90=None, **changes):
 
 
 def row_of(*episodes):
-    return row("p", "x", 2, "one-hop", episodes, SHORT.episode_ticks, 0)
+    return row("p", "x", 2, "one-hop", [episodes], SHORT.episode_ticks, 0)
 
 
 def test_an_episode_that_never_gets_there_counts_with_its_full_length():
@@ -90,6 +90,20 @@ def test_an_episode_that_never_gets_there_counts_with_its_full_length():
     assert numbers["coverage_min"] == 0.5
     low, high = numbers["t90_ci95"]
     assert (low, high) == (100.0, 150.0)
+
+
+def test_every_level_counts_alike_however_many_episodes_it_has():
+    """And the interval is of the episodes on these levels: that levels differ is not chance."""
+    easy, hard = [episode(0.95, 40, contacts=0)] * 8, [episode(0.91, 120, contacts=4)] * 2
+    numbers = row("p", "all", 2, "one-hop", [easy, hard], SHORT.episode_ticks, 0)
+    assert numbers["episodes"] == 10
+    assert numbers["t90_mean"] == 80.0
+    assert numbers["t90_ci95"] == (80.0, 80.0)
+    assert numbers["coverage_mean"] == pytest.approx(0.93)
+    assert numbers["coverage_ci95"] == pytest.approx((0.93, 0.93))
+    assert numbers["coverage_at"]["100"] == pytest.approx(0.93)
+    assert numbers["collisions_per_episode"] == 2.0
+    assert numbers["coverage_min"] == 0.91
 
 
 def test_coverage_is_told_at_ticks_that_episodes_last_and_stays_after_an_end():
@@ -113,7 +127,7 @@ def test_contacts_are_told_for_the_team_by_kind():
 def test_what_is_told_of_bytes_is_what_the_radio_sent():
     settings = SHORT.model_copy(update={"levels": ("1",), "drones": 2, "mirror": False, "random_launch": False})
     flown = run_episodes("frontier", settings, 1, 3)
-    told = row("frontier", "1", 2, "one-hop", flown, settings.episode_ticks, 0)["bytes_sent"]
+    told = row("frontier", "1", 2, "one-hop", [flown], settings.episode_ticks, 0)["bytes_sent"]
     budget = RadioSettings().rate_bps / 8.0 * TICK_S * flown[0].ticks + MeshSettings().burst_bytes
     assert all(told[kind] > 0.0 for kind in BYTE_KINDS)
     assert sum(told.values()) <= budget

@@ -122,6 +122,19 @@ def test_thousands_of_episodes_are_resampled_in_parts():
     assert high - low == pytest.approx(2 * 1.96 / np.sqrt(5000), rel=0.1)
 
 
+def test_levels_are_resampled_each_for_itself():
+    """Two levels whose means are far apart: pooled, resamples would mix them and the interval be 13 times as wide."""
+    rng = np.random.default_rng(0)
+    sizes = (40, 10)
+    values = np.concatenate([rng.normal(100.0, 10.0, 40), rng.normal(500.0, 10.0, 10)])
+    low, high = bootstrap_interval(values, np.random.default_rng(1), sizes)
+    expected = 2 * 1.96 * 0.5 * np.sqrt(10.0**2 / 40 + 10.0**2 / 10)
+    assert high - low == pytest.approx(expected, rel=0.25)
+    assert low < (values[:40].mean() + values[40:].mean()) / 2 < high
+    ratios = ratio_interval(values, np.repeat([100.0, 500.0], sizes), np.random.default_rng(1), sizes)
+    assert ratios[1] - ratios[0] == pytest.approx((high - low) / 300.0, rel=1e-6)
+
+
 def test_rows_say_how_they_compare_with_the_reference_level_by_level_and_over_all():
     contenders, reference = reference_of([contender_of("frontier"), contender_of("random")], None)
     plan = Plan(("0", "1"), drones=(2,), episodes=3)
@@ -148,7 +161,7 @@ def test_rows_say_how_they_compare_with_the_reference_level_by_level_and_over_al
 def test_one_compared_with_itself_is_equal():
     plan = Plan(("0",), drones=(1,), episodes=3)
     flown = run_episodes("frontier", plan.settings(SHORT, "0", Group("one-hop", 1)), 3, 0)
-    told = paired(flown, flown, "frontier", SHORT.episode_ticks, 0)
+    told = paired([flown], [flown], "frontier", SHORT.episode_ticks, 0)
     assert (told["t90_ratio"], told["t90_ratio_ci95"], told["t90_difference"]) == (1.0, (1.0, 1.0), 0.0)
 
 

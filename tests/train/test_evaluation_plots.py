@@ -51,7 +51,7 @@ def test_curves_are_the_means_of_the_episodes(comparison):
     lines = {line.get_label(): line for line in panels[1].lines if not line.get_label().startswith("_")}
     assert list(lines) == ["frontier", "random"]
     drawn = lines["frontier"].get_ydata()
-    episodes = comparison.episodes(0, TEAM, "1")
+    episodes = comparison.by_level(0, TEAM, "1")[0]
     assert drawn[9] == pytest.approx(np.mean([episode.curve[9] for episode in episodes]), abs=1e-6)
     assert drawn[-1] == pytest.approx(np.mean([episode.coverage for episode in episodes]), abs=1e-6)
 
@@ -70,19 +70,24 @@ def test_a_band_holds_the_mean_and_narrows_with_more_episodes():
     rng = np.random.default_rng(0)
     few, many = (rng.uniform(0.0, 1.0, (count, 20)).astype(np.float32) for count in (10, 1000))
     for curves in (few, many):
-        mean, low, high = curve_band(curves, 0)
+        mean, low, high = curve_band([curves], 0)
         assert ((low <= mean) & (mean <= high)).all()
-    widths = [np.mean(np.subtract(*curve_band(curves, 0)[:0:-1])) for curves in (few, many)]
+    widths = [np.mean(np.subtract(*curve_band([curves], 0)[:0:-1])) for curves in (few, many)]
     assert widths[1] < 0.2 * widths[0]
+
+
+def test_a_band_over_levels_counts_them_alike_and_is_of_their_episodes_alone():
+    one, other = np.full((9, 5), 0.2, np.float32), np.full((1, 5), 0.8, np.float32)
+    for told in curve_band([one, other], 0):
+        np.testing.assert_allclose(told, 0.5, atol=1e-6)
 
 
 def test_the_time_shown_ends_when_the_last_of_those_who_see_all_has():
     quick, slow, never = (
         np.clip(np.arange(1, 1001) / ticks, 0.0, end) for ticks, end in ((100, 1), (400, 1), (5000, 1))
     )
-    batches = [curve.astype(np.float32)[None] for curve in (quick, slow, never)]
-    assert 400 <= telling_ticks(batches) <= 480
-    assert telling_ticks([batches[2]]) == 1000
+    assert 400 <= telling_ticks([quick, slow, never]) <= 480
+    assert telling_ticks([never]) == 1000
 
 
 def test_many_levels_share_a_panel(comparison):

@@ -133,17 +133,17 @@ class Comparison:
 
     def _tell(self, who: int, group: Group, level: str) -> None:
         ticks, seed = self.episode_ticks, self.plan.seed
-        episodes = self.episodes(who, group, level)
-        told = row_of(self.contenders[who].name, level, group.drones, group.protocol, episodes, ticks, seed)
+        flown = self.by_level(who, group, level)
+        told = row_of(self.contenders[who].name, level, group.drones, group.protocol, flown, ticks, seed)
         if self.reference is not None and who != self.reference:
-            others = self.episodes(self.reference, group, level)
-            told["paired"] = paired(episodes, others, self.contenders[self.reference].name, ticks, seed)
+            others = self.by_level(self.reference, group, level)
+            told["paired"] = paired(flown, others, self.contenders[self.reference].name, ticks, seed)
         self._rows[who, group, level] = told
 
-    def episodes(self, who: int, group: Group, level: str) -> list[EpisodeMetrics]:
-        """Return what one flew on a level, or on all levels one after another."""
+    def by_level(self, who: int, group: Group, level: str) -> list[list[EpisodeMetrics]]:
+        """Return what one flew on a level, or on each of all levels: a list of episodes for every level."""
         levels = self.plan.levels if level == ALL_LEVELS else (level,)
-        return [episode for name in levels for episode in self._flown[who, group, name].episodes]
+        return [self._flown[who, group, name].episodes for name in levels]
 
 
 def evaluate(

@@ -76,17 +76,19 @@ def coverage_figure(comparison: Comparison, group: Group) -> Figure:
     figure = _figure(*size, "Coverage over time", comparison, group, "mean and its 95 % interval")
     panels = np.atleast_1d(figure.subplots(rows, columns, sharey=True, squeeze=False)).ravel()
     for panel, level in zip(panels, levels, strict=False):
-        flown = [comparison.episodes(who, group, level) for who in range(len(comparison.contenders))]
-        longest = max(episode.ticks for episodes in flown for episode in episodes)
-        for who, episodes in enumerate(flown):
-            curves = held_curves(episodes, longest)
+        flown = [comparison.by_level(who, group, level) for who in range(len(comparison.contenders))]
+        longest = max(episode.ticks for levels_flown in flown for episodes in levels_flown for episode in episodes)
+        drawn = [[held_curves(episodes, longest) for episodes in levels_flown] for levels_flown in flown]
+        means = []
+        for who, curves in enumerate(drawn):
             mean, low, high = curve_band(curves, comparison.plan.seed)
+            means.append(mean)
             seconds = np.arange(1, longest + 1) * TICK_S
             colour, dash = _style(comparison, who)
             panel.fill_between(seconds, low, high, color=colour, alpha=0.18, lw=0)
             panel.plot(seconds, mean, color=colour, ls=dash, lw=1.8, label=comparison.contenders[who].name)
         panel.axhline(0.9, color="#bbbbbb", lw=0.8, zorder=0)
-        panel.set_xlim(0, telling_ticks([held_curves(episodes, longest) for episodes in flown]) * TICK_S)
+        panel.set_xlim(0, telling_ticks(means) * TICK_S)
         panel.set_ylim(0, 1.02)
         panel.set_title(_level_title(comparison, level), fontsize=10, loc="left")
         _plain(panel)
@@ -185,26 +187,31 @@ def panels_of(comparison: Comparison) -> list[str]:
     return levels if len(levels) <= _MOST_PANELS else [ALL_LEVELS]
 
 
-def telling_ticks(flown: Sequence[NDArray[np.float32]]) -> int:
-    """Return how many ticks of everyone's curves, each `[episodes, ticks]`, are worth showing.
+def telling_ticks(means: Sequence[NDArray[np.float64]]) -> int:
+    """Return how many ticks of everyone's mean curves, each `[ticks]`, are worth showing.
 
     That is until the last of those who see nearly all has done so; those who never do would leave the others a margin.
     """
-    means = [curves.mean(axis=0) for curves in flown]
     settled = [int(np.argmax(mean >= mean[-1] - 0.003)) + 1 for mean in means if mean[-1] >= 0.9]
     longest = len(means[0])
     return min(longest, round(1.15 * max(settled)) + 1) if settled else longest
 
 
-def curve_band(curves: NDArray[np.float32], seed: int) -> tuple[NDArray[np.float64], ...]:
-    """Return the mean of curves `[episodes, ticks]`, and the ends of its 95 % bootstrap interval tick by tick."""
+def curve_band(levels: Sequence[NDArray[np.float32]], seed: int) -> tuple[NDArray[np.float64], ...]:
+    """Return the mean of curves, and the ends of its 95 % bootstrap interval, `[ticks]` each.
+
+    Curves come level by level, `[episodes, ticks]` each; levels count alike, and each is resampled for itself, as in
+    `rows.bootstrap_interval`.
+    """
     rng = np.random.default_rng(seed)
-    count = len(curves)
-    # how often each episode is drawn, as weights: a matrix product instead of gathering curves again and again
-    weights = rng.multinomial(count, np.full(count, 1.0 / count), _RESAMPLES) / count
-    means = weights @ curves
+    means = np.zeros((_RESAMPLES, levels[0].shape[1]))
+    for curves in levels:
+        count = len(curves)
+        # how often each episode is drawn, as weights: a matrix product instead of gathering curves again and again
+        weights = rng.multinomial(count, np.full(count, 1.0 / count), _RESAMPLES) / count
+        means += weights @ curves / len(levels)
     low, high = np.percentile(means, [2.5, 97.5], axis=0)
-    return curves.mean(axis=0, dtype=np.float64), low, high
+    return np.mean([curves.mean(axis=0, dtype=np.float64) for curves in levels], axis=0), low, high
 
 
 def _belongs(row: dict[str, Any], group: Group) -> bool:
