@@ -12,6 +12,7 @@ from rich.table import Table
 from imagine.core.errors import InputError
 from imagine.kernel_cache import announce_compiling
 from imagine.outputs import write_json
+from imagine.sim.exploration_tick import STAGES
 from imagine.train.bench import Results, bench_training
 from imagine.train.settings import TrainSettings, load_train_settings
 
@@ -64,6 +65,9 @@ def table_of(results: Results) -> Table:
         row = results[name]
         cpu = f"{row['cpu']:,.1f}" if "cpu" in row else ""
         table.add_row(shown, f"{row['value']:,.1f}", cpu, f"{1e6 / max(row['value'], 1e-9):,.0f}")
+        if name == "env":
+            for stage in STAGES:
+                table.add_row(f"    {stage}", "", f"{results[f'env_{stage}']['value']:,.1f}", "")
     table.add_row("all", f"{1e6 / told['value']:,.1f}", f"{1e6 / told['per_cpu_s']:,.1f}", f"{told['value']:,.0f}")
     table.caption = (
         f"Medians of {told['rounds']} rounds, {told['low']:,.0f} to {told['high']:,.0f} agent-steps/s. "

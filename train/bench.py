@@ -14,6 +14,7 @@ import torch
 
 from imagine.core.contract import LEVEL
 from imagine.sim.exploration import Exploration
+from imagine.sim.exploration_tick import STAGES
 from imagine.train.curriculum import Curriculum
 from imagine.train.learner import Learner
 from imagine.train.networks import at_precision, compute_dtype
@@ -38,6 +39,8 @@ class _Watch:
         """Count what happens within as a round."""
         wall, cpu = time.perf_counter(), time.process_time()
         yield
+        if torch.cuda.is_initialized():  # what was begun there counts until it is done
+            torch.cuda.synchronize()
         self.wall_s.append(time.perf_counter() - wall)
         self.cpu_s.append(time.process_time() - cpu)
 
@@ -62,22 +65,28 @@ class TrainingBench:
         `training` is the rate of rollout and update together, an agent-step being a decision, which may stand for
         several ticks of a drone; the other rows are microseconds an agent-step: `rollout`
         and its parts `env`, `acting` and `level_images` (which a critic or a centralised actor sees), `update` and its
-        part `values`. Parts are measured apart from the whole, after it.
+        part `values`. Parts are measured apart from the whole, after it; but `env` within it, and so are the stages of
+        its ticks, `env_fly` and so on: these are processor time, summed over threads, as all `cpu`.
         """
         progress("warm-up")
         rollout = self._collect(_WARM_STEPS)
         self._update(rollout)
         names = ("rollout", "update", "env", "level_images", "acting", "values")
         watches = {name: _Watch() for name in names}
+        stages = {name: _Watch() for name in STAGES}
+        self.env.time_stages()
         for number in range(rounds):
             progress(f"round {number + 1} of {rounds}")
+            before = dict(self.env.stage_seconds)
             with watches["rollout"].running():
                 rollout = self._collect(self.settings.ppo.rollout_steps)
             with watches["update"].running():
                 self._update(rollout)
             watches["env"].wall_s.append(rollout.env_s)
+            for name, stage in stages.items():
+                stage.cpu_s.append(self.env.stage_seconds[name] - before[name])
             self._time_parts(rollout, watches)
-        return self._results(rollout, watches)
+        return self._results(rollout, watches, stages)
 
     def _collect(self, steps: int) -> Rollout:
         ppo = self.settings.ppo
@@ -107,7 +116,7 @@ class TrainingBench:
             with watches["values"].running():
                 values_of(self.actor, self.critic, rollout, ppo.minibatch)
 
-    def _results(self, rollout: Rollout, watches: dict[str, _Watch]) -> Results:
+    def _results(self, rollout: Rollout, watches: dict[str, _Watch], stages: dict[str, _Watch]) -> Results:
         per_round = rollout.alive.numel()
         both = (watches["rollout"], watches["update"])
         rates = [per_round / sum(pair) for pair in zip(*(watch.wall_s for watch in both), strict=True)]
@@ -123,6 +132,12 @@ class TrainingBench:
             }
         }  # fmt: skip
         results |= {name: _microseconds(watch, per_round) for name, watch in watches.items()}
+        results |= {
+            f"env_{name}": {
+                "value": 1e6 * statistics.median(stage.cpu_s) / per_round, "unit": "us an agent-step of CPU time",
+            }
+            for name, stage in stages.items()
+        }  # fmt: skip
         results["parameters"] = {
             "value": sum(weight.numel() for weight in self.actor.parameters()),
             "critic": sum(weight.numel() for weight in self.critic.parameters()),

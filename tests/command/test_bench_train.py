@@ -39,14 +39,17 @@ def test_a_quick_run_measures_shows_and_writes_every_stage(tmp_path: Path, overr
     told = json.loads(results.read_text())
     assert all({"value", "unit"} <= row.keys() for row in told.values())
     stages = {"rollout", "update", "env", "level_images", "acting", "values"}
-    assert stages | {"training", "parameters", "cores"} == told.keys()
+    ticks = {f"env_{name}" for name in ("fly", "scan", "share", "derive", "observe")}
+    assert stages | ticks | {"training", "parameters", "cores"} == told.keys()
+    assert all(told[name]["value"] > 0.0 for name in ticks)
+    assert sum(told[name]["value"] for name in ticks) < told["rollout"]["cpu"]
     assert told["training"]["worlds"] == 2
     if overrides:
         assert told["training"]["precision"] == "float32"
     whole = told["rollout"]["value"] + told["update"]["value"]
     assert 1e6 / told["training"]["value"] == pytest.approx(whole)  # of a single round
     assert told["env"]["value"] < told["rollout"]["value"]
-    for text in ("2 worlds of 3 drones", "the twin", "update", "agent-steps/s", "weights"):
+    for text in ("2 worlds of 3 drones", "the twin", "  derive", "update", "agent-steps/s", "weights"):
         assert text in out
     assert "round 1 of 1" in err
 
