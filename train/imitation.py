@@ -156,7 +156,8 @@ def learn(
             if not (math.isfinite(loss.item()) and math.isfinite(norm)):
                 raise WorkError(
                     f"imitation diverged: the loss of the actor is {loss.item()}, its gradient {norm} long; "
-                    "go on from the last checkpoint with a smaller imitation.lr, or with imitation.precision float32"
+                    "begin anew, for imitation leaves no checkpoint before its end: imagine train --resume RUN --set "
+                    "imitation.lr=… with a smaller one, or --set imitation.precision=float32"
                 )
             optimiser.step()
             losses.append(loss.item())
