@@ -7,6 +7,7 @@ an encoder are their losses summed.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +16,7 @@ from imagine.core.errors import WorkError
 from imagine.train.batches import Batch, Cut
 from imagine.train.gae import advantages_and_returns
 from imagine.train.networks import LOG_STD_RANGE, Actor, Critic, Decisions, at_precision
+from imagine.train.networks.choice import has_choice
 from imagine.train.ppo_settings import PpoSettings
 from imagine.train.rollout import Rollout, mean_of
 from imagine.train.side_by_side import side_by_side
@@ -107,7 +109,8 @@ class _Update:
     def _judge(self, rollout: Rollout) -> tuple[dict[str, Tensor], Record]:
         """Return advantages, value targets and values, flat and normalised, of all samples; and what they are like."""
         settings, critic = self.settings, self.critic
-        lived = rollout.alive.flatten().nonzero().squeeze(1)  # nothing is learned from the steps of the dead
+        alive = rollout.alive.flatten()
+        lived = alive.nonzero().squeeze(1)  # nothing is learned from the steps of the dead
         values, last_values = values_of(self.actor, critic, rollout, settings.minibatch)
         advantages, returns = advantages_and_returns(
             rollout.rewards, values, rollout.dones, last_values, settings.gamma, settings.gae_lambda, rollout.truncated
@@ -119,19 +122,22 @@ class _Update:
             raise WorkError(f"{self._where()}: {bad} are not finite; {_REMEDY.format(key='ppo.critic_lr')}")
         if settings.value_normalisation:
             critic.rescale(targets)
+        if self.actor.choice is not None:  # of those choices alone that the policy learns from
+            decided = advantages[alive & has_choice(rollout.observations["frontiers"].flatten(0, 1))]
+            counted = decided if len(decided) > 1 else counted
         judged = {
             "advantages": (advantages - counted.mean()) / (counted.std() + 1e-8),
             "targets": critic.scale.normalised(returns),
             "values": critic.scale.normalised(values),
         }
+        # what is drawn by the head `choice` are numbers of frontiers, which have no size
+        size = {} if self.actor.choice else {"action_abs": float(rollout.actions.flatten(0, 1)[lived].abs().mean())}
         return judged, {
             "explained_variance": 1.0 - float((targets - values[lived]).var() / (targets.var() + 1e-8)),
             "reward": float(rollout.rewards.flatten()[lived].mean()),
             "return": float(targets.mean()),
             "return_std": float(targets.std()),
             "value": float(values[lived].mean()),
-        # what is drawn by the head `choice` are numbers of frontiers, which have no size
-        size = {} if self.actor.choice else {"action_abs": float(rollout.actions.flatten(0, 1)[lived].abs().mean())}
             "advantage_std": float(counted.std()),
             **size,
         }
@@ -195,14 +201,24 @@ class _Update:
         now = self.actor.log_probability(batch.of_counted(decisions.mean), scores, batch["actions"])
         log_ratio = now - batch["log_probs"]
         ratio = log_ratio.exp()
+        mean = self._mean_of_decided(batch)
         with torch.no_grad():  # the low-variance estimator of http://joschu.net/blog/kl-approx.html
-            kl = (ratio - 1.0 - log_ratio).mean().item()
+            kl = mean(ratio - 1.0 - log_ratio).item()
         clipped = ratio.clamp(1.0 - settings.clip, 1.0 + settings.clip)
-        gain = torch.min(ratio * advantages, clipped * advantages).mean()
+        gain = mean(torch.min(ratio * advantages, clipped * advantages))
         uncertainty = self.actor.entropy(scores)
-        record = {"kl": kl, "clipped_share": (ratio != clipped).float().mean().item(), "entropy": uncertainty.item()}
+        uncertainty = uncertainty if scores is None else mean(uncertainty)
+        record = {"kl": kl, "clipped_share": mean((ratio != clipped).float()).item(), "entropy": uncertainty.item()}
         far = settings.kl_stop is not None and kl > settings.kl_stop
         return -gain - self.entropy_weight * uncertainty, record, not far
+
+    def _mean_of_decided(self, batch: Batch) -> Callable[[Tensor], Tensor]:
+        """Return the mean over the rows `[rows]` in which there was something to decide; 0 where there is none."""
+        if self.actor.choice is None:
+            return torch.mean
+        decided = has_choice(batch["frontiers"])
+        count = decided.sum().clamp(min=1)
+        return lambda rows: torch.where(decided, rows, 0.0).sum() / count
 
     def _descend(self, loss: Tensor, parts: dict[str, Tensor], networks: tuple[nn.Module, ...], of: str) -> float:
         """Take one gradient step and return the gradient's length, unless it or a loss is not finite."""

@@ -185,8 +185,8 @@ class Actor(Computing):
         return log_probability(taken, mean, self.spread())
 
     def entropy(self, scores: Tensor | None) -> Tensor:
-        """Return the mean entropy of what is drawn."""
-        return entropy(self.spread()) if scores is None else choice_entropy(scores).mean()
+        """Return the entropy of what is drawn: of each row's choice, `[rows]`, or of all rows' actions, `[]`."""
+        return entropy(self.spread()) if scores is None else choice_entropy(scores)
 
     def _level(self, seen: Seen) -> Tensor | None:
         return seen[LEVEL].to(self.dtype) if self.is_central else None

@@ -45,6 +45,14 @@ def direction_of(frontiers: Tensor, choice: Tensor) -> Tensor:
     return frontiers[..., 1:3].gather(1, at).squeeze(1)
 
 
+def has_choice(frontiers: Tensor) -> Tensor:
+    """Tell where any of the frontiers `[rows, n, numbers]` is shown, bool `[rows]`.
+
+    Where none is, all scores are equally low: what is drawn there is no decision, and nothing is to be learned from it.
+    """
+    return (frontiers[..., 0] > 0.5).any(dim=1)
+
+
 def draw_choice(scores: Tensor, uniform: Tensor) -> Tensor:
     """Return choices, int64 `[rows]`, by the softmax of scores, for numbers in [0, 1) `[rows]`."""
     reached = torch.softmax(scores, dim=1).cumsum(dim=1)
