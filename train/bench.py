@@ -39,7 +39,7 @@ class _Watch:
         """Count what happens within as a round."""
         wall, cpu = time.perf_counter(), time.process_time()
         yield
-        if torch.cuda.is_initialized():  # what was begun there counts until it is done
+        if torch.cuda.is_available():  # what was begun there counts until it is done
             torch.cuda.synchronize()
         self.wall_s.append(time.perf_counter() - wall)
         self.cpu_s.append(time.process_time() - cpu)

@@ -63,9 +63,9 @@ class Rollout:
     `alive` tells which drones acted: what a dead one is said to have done counts for nothing. `dones[t]` tells that a
     drone's own episode ended with step t, by its death or with the world's, and `truncated[t]` that only the time limit
     ended it, while it still flew (`cut_off`). `last` holds the observation after the last step, `[agents, ...]`, and
-    `recall` what was remembered then; `level` images are the critic's own (and a centralised actor's); `env_s` is the time the
-    environment took. Images are kept in half precision, channels last: they are what costs memory, and the policy acts
-    by them as they are kept.
+    `recall` what was remembered then; `level` images are the critic's own (and a centralised actor's); `env_s` is the
+    time the environment took. Images are kept in half precision, channels last: they are what costs memory, and the
+    policy acts by them as they are kept.
 
     `actions` are what was drawn: actions, or the numbers of frontiers (`Actor.flown`).
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from imagine.sim.metrics import BYTE_KINDS, CONTACT_KINDS, EpisodeMetrics
 
@@ -39,8 +39,8 @@ def row(
     sizes = [len(flown) for flown in levels]
     episodes = [episode for flown in levels for episode in flown]
 
-    def mean(values: Sequence[float] | Sequence[Values] | Values) -> Any:
-        return level_mean(np.array(values, float), sizes).tolist()
+    def mean(values: ArrayLike) -> Any:
+        return level_mean(np.asarray(values, float), sizes).tolist()
 
     coverage = np.array([episode.coverage for episode in episodes])
     row: dict[str, Any] = {
