@@ -239,6 +239,18 @@ def test_a_planner_without_advice_teaches_nothing():
     assert len(buffer) == 3
 
 
+def test_imitation_that_diverges_names_what_can_be_done_without_a_checkpoint():
+    """There is none before imitation has ended, and none is promised."""
+    actor, _, _, generator = learners()
+    buffer = LabelBuffer(10)
+    buffer.add({key: torch.ones((3, *shape)) for key, shape in SPEC.shapes.items()}, torch.full((3, 2), torch.inf))
+    before = actor.mean.weight.detach().clone()
+    with pytest.raises(WorkError, match=r"begin anew, .*no checkpoint before its end: .*--resume RUN --set") as told:
+        learn(actor, torch.optim.Adam(actor.parameters()), buffer, ImitationSettings(), generator)
+    assert "last checkpoint" not in str(told.value)
+    assert torch.equal(actor.mean.weight, before)
+
+
 def test_a_rollout_holds_what_was_seen_done_and_earned():
     env = Exploration(ExplorationSettings(levels=("0",), worlds=2, drones=2, episode_ticks=8, observation=SPEC), seed=1)
     actor, _, _, generator = learners()
