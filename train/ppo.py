@@ -242,7 +242,7 @@ class _Update:
         """Return how far actions are drawn from their means, where actions are drawn; and what was scheduled."""
         numbers = {}
         if self.actor.choice is None:
-            std = self.actor.spread().detach().exp().tolist()
+            std = self.actor.spread().detach().exp().cpu().tolist()
             numbers = {f"action_std_{i}": value for i, value in enumerate(std)} | {"action_std": sum(std) / len(std)}
         return {
             **numbers,
