@@ -43,7 +43,7 @@ class Track:
         self._last: DroneView | None = None
 
     def observe(self, peer: Peer | None, place: Standing, now: float) -> tuple[DroneView, list[News]]:
-        """Return the drone as it is now, and what is new since the last look. 
+        """Return the drone as it is now, and what is new since the last look.
 
         `peer` None: never heard; `place` is what the ground knows of the drone's frame.
         """

@@ -146,7 +146,7 @@ def _show(console: Console, found: dict[str, Any]) -> None:
         ending = "; ".join(filter(None, (drone["error"], failsafes))) or drone["reason"] or drone["phase"]
         endings.setdefault(ending, []).append(f"D{drone['id']}")
     console.print(table, highlight=False)
-    for line in _placed(found):
+    for line in filter(None, (_taught(found), *_placed(found))):
         console.print(line, highlight=False, markup=False)
     for ending, names in endings.items():
         console.print(f"{', '.join(names)}: {ending}", highlight=False, markup=False)
@@ -155,17 +155,21 @@ def _show(console: Console, found: dict[str, Any]) -> None:
 def _known(drone: dict[str, Any]) -> tuple[str, ...]:
     """Return distance, cells and bytes in words; a drone that was killed left none."""
     if drone["distance_m"] is None:
-        return ("lost",) + ("",) * 6
+        return ("lost",) + ("",) * 4
     sent = sum(drone["bytes_sent"].values()) / 1000
     cells = (str(drone[kind]) for kind in ("own_cells", "scan_cells", "map_cells"))
-    return (f"{drone['distance_m']:.1f} m", *cells, f"{sent:.0f} kB", *_taught(drone["receipts"]))
+    return (f"{drone['distance_m']:.1f} m", *cells, f"{sent:.0f} kB")
 
 
-def _taught(receipts: dict[str, dict[str, int]] | None) -> tuple[str, str]:
-    """Return the cells that peers learned from a drone, and how many a byte of scans and tiles bought, in words."""
-    bought = list((receipts or {}).values())
-    cells, spent = sum(r["cells"] for r in bought), sum(r["bytes"] for r in bought)
-    return str(cells), f"{cells / spent:.2f}" if spent else "nothing"
+def _taught(found: dict[str, Any]) -> str:
+    """Return what the drones' scans and tiles told their peers, in a line; empty where nothing was told."""
+    told = []
+    for drone in found["drones"]:
+        bought = (drone["receipts"] or {}).values()
+        cells, spent = sum(r["cells"] for r in bought), sum(r["bytes"] for r in bought)
+        if spent:
+            told.append(f"D{drone['id']} {cells} cells ({cells / spent:.2f} a byte)")
+    return f"taught their peers: {', '.join(told)}" if told else ""
 
 
 def _placed(found: dict[str, Any]) -> list[str]:
