@@ -131,14 +131,15 @@ def fly(
     if not sim:
         _fly_vehicle(vehicle, lidar, mesh, policy, protocol, frame, config, overrides or [], json_file)
         return
+    shared, begun = _protocol(protocol or "one-hop"), _frame(frame or "shared")  # refused before anything starts
     from imagine.runner_processes import RunnerProcesses
 
     with RunnerProcesses(drones) as processes:  # they load their code while this process loads its own
         from imagine.fly_command import fly_in_twin
 
         fly_in_twin(
-            processes, _BEGAN, level=level, drones=drones, policy=policy, protocol=_protocol(protocol or "one-hop"),
-            frame=_frame(frame or "shared"), ticks=ticks, lockstep=lockstep, speed=speed, headless=headless, seed=seed,
+            processes, _BEGAN, level=level, drones=drones, policy=policy, protocol=shared,
+            frame=begun, ticks=ticks, lockstep=lockstep, speed=speed, headless=headless, seed=seed,
             port=port, map_file=map_file, json_file=json_file, twin_file=twin_file, overrides=overrides or [],
         )  # fmt: skip
 

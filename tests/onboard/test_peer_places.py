@@ -88,6 +88,6 @@ def test_the_report_tells_places_and_what_bytes_bought() -> None:
     assert set(report["receipts"]) == {"scan", "tile", "repeat"}
     assert report["receipts"]["scan"]["bytes"] == own.bytes_sent["scan"] > 0
     assert sum(receipt["bytes"] for receipt in report["receipts"].values()) == pytest.approx(
-        own.bytes_sent["scan"] + own.bytes_sent["tile"]
-    )
+        own.bytes_sent["scan"] + own.bytes_sent["tile"], abs=5
+    )  # a message's bytes are shared out among its tiles in whole bytes
     assert sum(receipt["cells"] for receipt in report["receipts"].values()) > 300
