@@ -127,8 +127,6 @@ def _show(console: Console, found: dict[str, Any]) -> None:
         "by scans",
         "by maps",
         "sent",
-        "taught",
-        "a byte",
         "pose error",
         "tick p99",
     ):

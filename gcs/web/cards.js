@@ -53,7 +53,7 @@ class Card {
     this.badge = make("span", { class: "badge" }, this.glyph, this.state);
     this.placeGlyph = make("span", { class: "glyph", "aria-hidden": "true" });
     this.placeText = make("span", { "data-testid": `drone-${id}-place` });
-    this.place = make("span", { class: "badge place", hidden: "" }, this.placeGlyph, this.placeText);
+    this.place = make("p", { class: "placing", hidden: "" }, make("span", { class: "badge place" }, this.placeGlyph, this.placeText));
     this.follow = make("button", { type: "button", class: "quiet", "aria-pressed": "false", "aria-label": `Follow drone ${id} on the map`, text: "Follow" });
     this.follow.addEventListener("click", () => onFollow(id));
     this.reason = make("p", { class: "reason", "data-testid": `drone-${id}-reason` });
@@ -63,8 +63,8 @@ class Card {
     this.charge = make("span", { "data-testid": `drone-${id}-battery` });
     this.kinds = make("dd", { class: "kinds" });
     this.root = make("article", { "data-testid": `drone-card-${id}`, "aria-label": `Drone ${id}` },
-      make("header", {}, swatch, make("h3", { text: `Drone ${id}` }), this.badge, this.place, this.follow),
-      this.reason, this.note,
+      make("header", {}, swatch, make("h3", { text: `Drone ${id}` }), this.badge, this.follow),
+      this.place, this.reason, this.note,
       make("dl", {},
         make("div", {}, make("dt", { text: "Battery" }), make("dd", { class: "battery" }, this.level, this.charge)),
         field("height", "Height"), field("speed", "Speed"), field("age", "Data age"),
