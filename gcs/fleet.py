@@ -105,7 +105,7 @@ class Fleet:
             self._log(now, drone, "warning", f"never confirmed the order to {action}")
         drones: list[DroneView] = []
         for drone, track in sorted(self._tracks.items()):
-            view, news = track.observe(peers.get(drone), now)
+            view, news = track.observe(peers.get(drone), self.node.place(drone).standing, now)
             drones.append(view)
             for severity, text in news:
                 self._log(now, drone, severity, text)

@@ -45,6 +45,7 @@ _ASSETS = {
     "index.html": ("index.html", "text/html; charset=utf-8"),
     "app.js": ("app.js", "text/javascript; charset=utf-8"),
     "map.js": ("map.js", "text/javascript; charset=utf-8"),
+    "cell.js": ("cell.js", "text/javascript; charset=utf-8"),
     "cards.js": ("cards.js", "text/javascript; charset=utf-8"),
     "link.js": ("link.js", "text/javascript; charset=utf-8"),
     "style.css": ("style.css", "text/css; charset=utf-8"),

@@ -9,6 +9,7 @@ from typing import Literal
 
 from imagine.core.evidence import TileKey
 from imagine.core.raster import CELL, TILE
+from imagine.mesh_comm.placement import Standing
 
 Severity = Literal["info", "warning", "error"]
 
@@ -55,6 +56,10 @@ class DroneView:
     map_cells: int
     bytes_sent: Mapping[str, int]
     """Bytes the drone has sent, by kind of message."""
+    taught: Mapping[str, int]
+    """Cells that peers learned by the drone's scans and tiles, as it says itself."""
+    place: Standing
+    """Whether the ground knows where the drone's frame lies in the one shown; where not, its map is not shown."""
     rate_bps: float
     """Bytes a second the drone sent lately."""
     age_s: float

@@ -34,6 +34,7 @@ _COLUMNS = (
     _Column("hears", "left", 100),
     _Column("why", "left", 0),
 )
+_UNPLACED = {"unknown": "not placed", "candidate": "being placed"}
 _SEVERITY_STYLE = {"info": "dim", "warning": "yellow", "error": "bold red"}
 
 
@@ -73,7 +74,7 @@ def _row(drone: DroneView, cell_m: float) -> list[RenderableType]:
     return [
         f"D{drone.id}",
         Text(state, style="bold red" if drone.stale else _STATE_STYLE.get(drone.state, "")),
-        f"{drone.x:.1f}, {drone.y:.1f}" if drone.located else "unknown",
+        f"{drone.x:.1f}, {drone.y:.1f}" if drone.located else _UNPLACED.get(drone.place, "unknown"),
         f"{drone.height_m:.1f} m",
         "unknown" if drone.battery is None else f"{drone.battery:.0%}",
         f"{drone.mode or 'unknown'}{'' if drone.armed else ' (disarmed)'}",

@@ -10,6 +10,7 @@ from imagine.core.frames import Pose
 from imagine.gcs.snapshot import DroneView, Severity, Trail
 from imagine.mesh_comm.messages import GROUND, Status
 from imagine.mesh_comm.node import Peer
+from imagine.mesh_comm.placement import Standing
 
 TRAIL_POINTS = 400
 TRAIL_STEP_M = 0.15
@@ -21,6 +22,7 @@ _LOW_BATTERY = 0.2
 _AIRBORNE_M = 0.15
 _LINK_FRESH_S = 2.0
 _EXPLORING = ("policy", "frontier")
+_PLACED: tuple[Standing, ...] = ("given", "trusted")
 _UNTOLD = Status(0, 0.0, Pose(0.0, 0.0, 0.0))
 
 News = tuple[Severity, str]
@@ -40,14 +42,17 @@ class Track:
         self._sent: deque[tuple[float, int]] = deque()
         self._last: DroneView | None = None
 
-    def observe(self, peer: Peer | None, now: float) -> tuple[DroneView, list[News]]:
-        """Return the drone as it is now, and what is new since the last look. `peer` None: never heard."""
-        view = self._view(peer, now)
+    def observe(self, peer: Peer | None, place: Standing, now: float) -> tuple[DroneView, list[News]]:
+        """Return the drone as it is now, and what is new since the last look.
+
+        `peer` None: never heard; `place` is what the ground knows of the drone's frame.
+        """
+        view = self._view(peer, place, now)
         news = _news(self._last, view)
         self._last = view
         return view, news
 
-    def _view(self, peer: Peer | None, now: float) -> DroneView:
+    def _view(self, peer: Peer | None, place: Standing, now: float) -> DroneView:
         told = (peer.status if peer else None) or _UNTOLD
         pose = peer.pose if peer else None
         age = max(0.0, peer.age_s) if peer else max(0.0, now - self._since)
@@ -75,6 +80,8 @@ class Track:
             scan_cells=told.scan_cells,
             map_cells=told.map_cells,
             bytes_sent=MappingProxyType(dict(told.bytes_sent)),
+            taught=MappingProxyType(dict(told.taught)),
+            place=place,
             rate_bps=self._rate(sum(told.bytes_sent.values()), now),
             age_s=age,
             stale=stale,
@@ -109,7 +116,11 @@ def _news(old: DroneView | None, new: DroneView) -> list[News]:
     """Return what the pilot should be able to read back about the change from one view to the next."""
     news: list[News] = []
     if old is None:
-        return [("info", "joined the swarm")] if new.located else []
+        return [("info", "joined the swarm")] if new.located or new.place not in _PLACED else []
+    if new.place in _PLACED and old.place not in _PLACED:
+        news.append(("info", "its place in the map is known"))
+    if old.place in _PLACED and new.place not in _PLACED:
+        news.append(("warning", "its place in the map is not known any more: the maps contradict it"))
     if new.stale and not old.stale and not new.lost:
         news.append(("error", f"not heard for {STALE_S} s; last in {new.mode or 'unknown mode'}, {new.state}"))
     if old.stale and not new.stale:

@@ -86,6 +86,8 @@ def _drone(drone: DroneView, trail_end: int) -> dict[str, Any]:
         "scan_cells": drone.scan_cells,
         "map_cells": drone.map_cells,
         "bytes_sent": dict(drone.bytes_sent),
+        "taught": dict(drone.taught),
+        "place": drone.place,
         "rate_bps": round(drone.rate_bps, 1),
         "age_s": round(drone.age_s, 2),
         "stale": drone.stale,

@@ -20,7 +20,7 @@ from imagine.core.errors import ImagineError, InputError
 from imagine.outputs import check_outputs
 
 if TYPE_CHECKING:  # a command imports what it runs when it runs, so that each starts fast
-    from imagine.mesh_comm.settings import Protocol
+    from imagine.mesh_comm.settings import Frame, Protocol
 
 _INTERRUPTED = 130
 _BEGAN = time.monotonic()
@@ -100,6 +100,7 @@ def fly(
     drones: Annotated[int, typer.Option(min=1, max=16, help="with --sim: how many drones")] = 3,
     policy: Annotated[str | None, typer.Option(help="ONNX file, or 'frontier' for the planner alone")] = None,
     protocol: Annotated[str | None, typer.Option(help="off, one-hop (the default) or multi-hop")] = None,
+    frame: Annotated[str | None, typer.Option(help="the drones map in: shared, layout or unknown frames")] = None,
     ticks: Annotated[int, typer.Option(min=1, help="with --sim: fly so long at most, in tenths of a second")] = 1000,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="repeatable, as fast as the machine")] = False,
     speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="simulated seconds per second")] = 1.0,
@@ -128,17 +129,18 @@ def fly(
         why = "is for a drone of its own; --sim wires its drones itself" if sim else "goes with --sim"
         raise InputError(f"fly: {flag} {why}")
     if not sim:
-        _fly_vehicle(vehicle, lidar, mesh, policy, protocol, config, overrides or [], json_file)
+        _fly_vehicle(vehicle, lidar, mesh, policy, protocol, frame, config, overrides or [], json_file)
         return
+    shared, begun = _protocol(protocol or "one-hop"), _frame(frame or "shared")  # refused before anything starts
     from imagine.runner_processes import RunnerProcesses
 
     with RunnerProcesses(drones) as processes:  # they load their code while this process loads its own
         from imagine.fly_command import fly_in_twin
 
         fly_in_twin(
-            processes, _BEGAN, level=level, drones=drones, policy=policy, protocol=_protocol(protocol or "one-hop"),
-            ticks=ticks, lockstep=lockstep, speed=speed, headless=headless, seed=seed, port=port,
-            map_file=map_file, json_file=json_file, twin_file=twin_file, overrides=overrides or [],
+            processes, _BEGAN, level=level, drones=drones, policy=policy, protocol=shared,
+            frame=begun, ticks=ticks, lockstep=lockstep, speed=speed, headless=headless, seed=seed,
+            port=port, map_file=map_file, json_file=json_file, twin_file=twin_file, overrides=overrides or [],
         )  # fmt: skip
 
 
@@ -148,6 +150,7 @@ def _fly_vehicle(
     mesh: str | None,
     policy: str | None,
     protocol: str | None,
+    frame: str | None,
     config: Path | None,
     overrides: list[str],
     json_file: Path | None,
@@ -162,6 +165,8 @@ def _fly_vehicle(
         flags.append("policy=null" if policy == "frontier" else f"policy={json.dumps(policy)}")
     if protocol is not None:
         flags.append(f"radio.protocol={_protocol(protocol)}")
+    if frame is not None:
+        flags.append(f"radio.frame={_frame(frame)}")
     logging.getLogger().setLevel(logging.INFO)
     status = run_drone(load_settings(DroneSettings, config, [*flags, *overrides]))
     if status:
@@ -522,6 +527,15 @@ def _protocol(name: str) -> Protocol:
         if name == known:
             return cast(Protocol, known)
     raise InputError(f"--protocol {name}: expected {', '.join(get_args(Protocol))}")
+
+
+def _frame(name: str) -> Frame:
+    from imagine.mesh_comm.settings import Frame
+
+    for known in get_args(Frame):
+        if name == known:
+            return cast(Frame, known)
+    raise InputError(f"--frame {name}: expected {', '.join(get_args(Frame))}")
 
 
 if __name__ == "__main__":

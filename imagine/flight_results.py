@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine.core.frames import IDENTITY, Pose, compose
+from imagine.mesh_comm.settings import Frame
 from imagine.onboard.ladder import Decider
 from imagine.onboard.report import SENT_KINDS
 from imagine.sim.server import TickRecord
@@ -18,8 +20,13 @@ DECIDERS = tuple(rung.value for rung in Decider)
 
 @dataclass
 class FlightLog:
-    """Collected while flying: coverage by tick, the true poses at every stamp, the latest record."""
+    """Collected while flying: coverage by tick, the true poses at every stamp, the latest record.
 
+    `frames`: where each drone's own frame lies in the twin's, by number; what it reports is in its own.
+    """
+
+    frame: Frame = "shared"
+    frames: dict[int, Pose] = field(default_factory=dict)
     coverage: list[float] = field(default_factory=list)
     truth: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     last: TickRecord | None = None
@@ -39,6 +46,7 @@ def results(
     drones = [_drone(number, report, deaths.get(number, ""), log) for number, report in sorted(reports.items())]
     tick_ms = [report["tick_ms"] for report in reports.values() if report is not None]
     return {
+        "frame": log.frame,
         "coverage": round(log.coverage[-1], 4) if log.coverage else 0.0,
         "ticks": len(log.coverage),
         "t90": _first_at_least(log.coverage, 0.90),
@@ -74,8 +82,10 @@ def _drone(number: int, report: dict[str, Any] | None, death: str, log: FlightLo
         "scan_cells": found.get("scan_cells"),
         "map_cells": found.get("map_cells"),
         "bytes_sent": found.get("bytes_sent", dict.fromkeys(SENT_KINDS)),
+        "receipts": found.get("receipts"),
+        "peers": found.get("peers"),
         "setpoints": found.get("setpoints"),
-        "pose_rmse_m": pose_rmse(trajectory, log.truth, number - 1),
+        "pose_rmse_m": pose_rmse(trajectory, log.truth, number - 1, log.frames.get(number, IDENTITY)),
         "decided_by": found.get("decided_by", dict.fromkeys(DECIDERS, 0)),
         "tick_ms": found.get("tick_ms"),
         "phase": found.get("phase", "lost"),
@@ -85,11 +95,17 @@ def _drone(number: int, report: dict[str, Any] | None, death: str, log: FlightLo
     }
 
 
-def pose_rmse(trajectory: list[list[float]], truth: dict[int, NDArray[np.float64]], index: int) -> float | None:
-    """Return the rms distance (m) of an estimated trajectory (rows stamp, x, y, yaw) to the true poses."""
+def pose_rmse(
+    trajectory: list[list[float]], truth: dict[int, NDArray[np.float64]], index: int, frame: Pose = IDENTITY
+) -> float | None:
+    """Return the rms distance (m) of an estimated trajectory (rows stamp, x, y, yaw) to the true poses.
+
+    `frame` is where the trajectory's frame lies in that of the truth: the drone's launch, which it starts at exactly.
+    """
+    rows = [(stamp, *compose(frame, Pose(x, y, yaw))) for stamp, x, y, yaw in trajectory]
     squares = [
         (x - truth[_stamp_key(stamp)][index, 0]) ** 2 + (y - truth[_stamp_key(stamp)][index, 1]) ** 2
-        for stamp, x, y, _ in trajectory
+        for stamp, x, y, _ in rows
         if _stamp_key(stamp) in truth
     ]
     return round(math.sqrt(sum(squares) / len(squares)), 4) if squares else None

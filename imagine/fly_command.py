@@ -16,7 +16,7 @@ from imagine.core.errors import WorkError
 from imagine.fly_sim import FlyOptions, Watcher, fly_sim
 from imagine.gcs.snapshot import FleetSnapshot
 from imagine.gcs.table import render
-from imagine.mesh_comm.settings import Protocol
+from imagine.mesh_comm.settings import Frame, Protocol
 from imagine.onboard.settings import DEFAULT_POLICY
 from imagine.outputs import write_json
 from imagine.runner_processes import RunnerProcesses
@@ -58,6 +58,7 @@ def fly_in_twin(
     drones: int,
     policy: str | None,
     protocol: Protocol,
+    frame: Frame,
     ticks: int,
     lockstep: bool,
     speed: float,
@@ -75,6 +76,7 @@ def fly_in_twin(
         drones=drones,
         policy=None if policy == "frontier" else Path(policy) if policy is not None else DEFAULT_POLICY,
         protocol=protocol,
+        frame=frame,
         ticks=ticks,
         lockstep=lockstep,
         speed=speed,
@@ -118,7 +120,16 @@ def _show(console: Console, found: dict[str, Any]) -> None:
         highlight=False,
     )
     table = Table(box=None, header_style="dim", pad_edge=False)
-    for name in ("drone", "flown", "own cells", "by scans", "by maps", "sent", "pose error", "tick p99"):
+    for name in (
+        "drone",
+        "flown",
+        "own cells",
+        "by scans",
+        "by maps",
+        "sent",
+        "pose error",
+        "tick p99",
+    ):
         table.add_column(name, justify="left" if name == "drone" else "right", no_wrap=True)
     endings: dict[str, list[str]] = {}
     for drone in found["drones"]:
@@ -133,6 +144,8 @@ def _show(console: Console, found: dict[str, Any]) -> None:
         ending = "; ".join(filter(None, (drone["error"], failsafes))) or drone["reason"] or drone["phase"]
         endings.setdefault(ending, []).append(f"D{drone['id']}")
     console.print(table, highlight=False)
+    for line in filter(None, (_taught(found), *_placed(found))):
+        console.print(line, highlight=False, markup=False)
     for ending, names in endings.items():
         console.print(f"{', '.join(names)}: {ending}", highlight=False, markup=False)
 
@@ -144,6 +157,35 @@ def _known(drone: dict[str, Any]) -> tuple[str, ...]:
     sent = sum(drone["bytes_sent"].values()) / 1000
     cells = (str(drone[kind]) for kind in ("own_cells", "scan_cells", "map_cells"))
     return (f"{drone['distance_m']:.1f} m", *cells, f"{sent:.0f} kB")
+
+
+def _taught(found: dict[str, Any]) -> str:
+    """Return what the drones' scans and tiles told their peers, in a line; empty where nothing was told."""
+    told = []
+    for drone in found["drones"]:
+        bought = (drone["receipts"] or {}).values()
+        cells, spent = sum(r["cells"] for r in bought), sum(r["bytes"] for r in bought)
+        if spent:
+            told.append(f"D{drone['id']} {cells} cells ({cells / spent:.2f} a byte)")
+    return f"taught their peers: {', '.join(told)}" if told else ""
+
+
+def _placed(found: dict[str, Any]) -> list[str]:
+    """Return, for flights whose drones share no frame, a line for each drone: when it knew its peers' places."""
+    if found["frame"] == "shared":
+        return []
+    lines = []
+    for drone in found["drones"]:
+        told = [
+            f"D{peer['id']} {peer['standing'] if peer['placed_s'] is None else _since(peer)}"
+            for peer in drone["peers"] or ()
+        ]
+        lines.append(f"D{drone['id']} places its peers: {', '.join(told) or 'none heard'}")
+    return lines
+
+
+def _since(peer: dict[str, Any]) -> str:
+    return f"{peer['standing']} since {peer['placed_s']:.1f} s"
 
 
 def _reached(tick: int | None) -> str:

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from imagine.core.errors import ImagineError, InputError, WorkError
-from imagine.core.frames import Pose
+from imagine.core.frames import IDENTITY, Pose
 from imagine.first_start import compile_kernels, warm_twin
 from imagine.flight_ground import FlightGround
 from imagine.flight_results import FlightLog, results
 from imagine.flown_map import draw_flown_map
 from imagine.gcs.snapshot import FleetSnapshot
-from imagine.mesh_comm.settings import MeshSettings, Protocol
+from imagine.mesh_comm.settings import Frame, MeshSettings, Protocol
 from imagine.onboard.build import load_policy
 from imagine.onboard.odometry_settings import OdometrySettings
 from imagine.onboard.settings import DEFAULT_POLICY, DroneSettings, LaunchPose
@@ -41,12 +41,17 @@ _LOCKSTEP_REPLY_S = 10.0  # a runner that lives but is slow is waited for; a dea
 
 @dataclass(frozen=True)
 class FlyOptions:
-    """What `imagine fly --sim` is asked for. `port` is that of the page; ticks are tenths of a second."""
+    """What `imagine fly --sim` is asked for. `port` is that of the page; ticks are tenths of a second.
+
+    `frame`: whether the drones know how they stand to each other (`MeshSettings.frame`); where they share no frame each
+    maps in its own, begun where it stands, and under `layout` is told where all of them stand.
+    """
 
     level: str = "4"
     drones: int = 3
     policy: Path | None = DEFAULT_POLICY
     protocol: Protocol = "one-hop"
+    frame: Frame = "shared"
     ticks: int = 1000
     lockstep: bool = False
     speed: float = 1.0
@@ -82,10 +87,11 @@ def fly_sim(options: FlyOptions, processes: RunnerProcesses, watcher: Watcher, b
     with ExitStack() as stack:
         stopping = stack.enter_context(StopSignals())
         level = load_level(options.level)
+        launches = level.launch_poses(options.drones)
         twin = Twin(
             [level], options.drones, seed=options.seed, dynamics=options.twin.dynamics, sensing=options.twin.sensing
         )
-        settings = drone_settings(options, level.launch_poses(options.drones))
+        settings = drone_settings(options, launches)
         load_policy(settings[0])  # refuses a model that does not fit
         ground: FlightGround | None = None
         if not options.headless:
@@ -112,7 +118,7 @@ def fly_sim(options: FlyOptions, processes: RunnerProcesses, watcher: Watcher, b
         except WorkError as error:
             raise _why_not_connected(error, processes, options.drones) from error
         stopping.flying = True
-        flight = _Flight(options, server, processes, ground, coverage, watcher, began)
+        flight = _Flight(options, launches, server, processes, ground, coverage, watcher, began)
         flight.run(stopping)
         processes.request_end()
         processes.wait_end()
@@ -123,7 +129,7 @@ def fly_sim(options: FlyOptions, processes: RunnerProcesses, watcher: Watcher, b
             ending = f"Flight over: coverage {found['coverage']:.1%}, {down} of {options.drones} drones are down."
             ground.finish(last.time_s, found["coverage"], ending)
         if options.map_image is not None:
-            draw_flown_map(processes, options.drones, options.map_image)
+            draw_flown_map(processes, flight.log.frames, options.map_image)
         return found
 
 
@@ -133,6 +139,7 @@ class _Flight:
     def __init__(
         self,
         options: FlyOptions,
+        launches: Sequence[Pose],
         server: SitlServer,
         processes: RunnerProcesses,
         ground: FlightGround | None,
@@ -142,7 +149,8 @@ class _Flight:
     ) -> None:
         self.options, self.server, self.processes = options, server, processes
         self.ground, self.coverage, self.watcher, self.began = ground, coverage, watcher, began
-        self.log = FlightLog()
+        begun = [IDENTITY] * options.drones if options.frame == "shared" else launches
+        self.log = FlightLog(options.frame, dict(enumerate(begun, start=1)))
         self.first_motion_s = 0.0
         self._has_flown = [False] * options.drones
 
@@ -191,7 +199,9 @@ def _moves(record: TickRecord) -> bool:
 
 def drone_settings(options: FlyOptions, poses: Sequence[Pose]) -> list[DroneSettings]:
     """Return what each drone of the flight is given, from number 1 on, before it is wired."""
-    radio = MeshSettings(protocol=options.protocol)
+    layout = {number: tuple(pose) for number, pose in enumerate(poses, start=1)} if options.frame == "layout" else {}
+    radio = MeshSettings.model_validate({"protocol": options.protocol, "frame": options.frame, "layout": layout})
+    starts = poses if options.frame == "shared" else [IDENTITY] * len(poses)
     odometry = OdometrySettings(deskew=options.twin.sensing.skew)
     return [
         DroneSettings(
@@ -203,7 +213,7 @@ def drone_settings(options: FlyOptions, poses: Sequence[Pose]) -> list[DroneSett
             lockstep=options.lockstep,
             stay=True,
         )
-        for number, pose in enumerate(poses, start=1)
+        for number, pose in enumerate(starts, start=1)
     ]
 
 

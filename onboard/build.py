@@ -8,11 +8,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from imagine.core.evidence import EvidenceMap
+from imagine.core.frames import Pose
 from imagine.core.frontier import frontier_field, own_distance
 from imagine.core.lidar import TEAMMATE_RADIUS_M, LidarSpec, Scan, mask_near
 from imagine.core.observation import observe
 from imagine.core.observation_spec import ObservationSpec
 from imagine.core.peer_poses import PeerPoses
+from imagine.core.placed_layer import PlacedLayer
 from imagine.core.planner import plan_velocity
 from imagine.core.shield import shield_velocity
 from imagine.core.visits import VisitMap
@@ -91,6 +93,7 @@ def _rehearse_flight(settings: DroneSettings, policy: Policy | None, scan: Scan,
     own_distance(field, origin, pose.x, pose.y)
     plan_velocity(field, origin, pose, scan, lidar, settings.limits.speed_mps)
     shield_velocity(0.1, 0.0, scan, lidar, settings.limits)
+    PlacedLayer(Pose(0.1, 0.1, 0.1)).refresh(evidence.layers[evidence.own].cells, origin)
     mask_near(scan.ranges, lidar, pose, np.zeros((1, 2)), TEAMMATE_RADIUS_M)
     if policy is not None:
         spec = policy.contract.observation

@@ -151,7 +151,7 @@ class Loop:
     def leave_behind(self, report: Path | None, map_out: Path | None) -> None:
         """Write the report and the map, where they are wanted."""
         if report is not None:
-            write_report(report, self.record.as_json(self.runner.evidence, self.runner.mesh))
+            write_report(report, self.record.as_json(self.runner.evidence, self.runner.mesh, self.runner.places))
         if map_out is not None:
             write_map(map_out, self.runner.evidence)
 

@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from imagine.core.evidence import EvidenceMap
 from imagine.mesh_comm.node import MeshNode
 from imagine.onboard.ladder import Decider
 from imagine.onboard.phases import Phase
+from imagine.onboard.places import PeerPlaces
 from imagine.onboard.records import Event, TickOutput
 
 _TRACK_STEP_M = 0.02  # shorter moves are estimate noise, not distance flown
@@ -61,8 +63,11 @@ class FlightRecord:
             self.distance_m += step
             self._last_place = (x, y)
 
-    def as_json(self, evidence: EvidenceMap, mesh: MeshNode | None) -> dict[str, Any]:
-        """Return the report: metres, milliseconds, cells, bytes; `trajectory` rows are stamp, x, y, yaw."""
+    def as_json(self, evidence: EvidenceMap, mesh: MeshNode | None, places: PeerPlaces | None = None) -> dict[str, Any]:
+        """Return the report: metres, milliseconds, cells, bytes; `trajectory` rows are stamp, x, y, yaw.
+
+        `trajectory` is in the drone's own frame; `places` tells when it knew where its peers' frames lie in it.
+        """
         own = int(np.count_nonzero(evidence.layers[evidence.own].cells))
         p50, p99 = np.percentile(self.tick_ms, (50, 99)) if self.tick_ms else (0.0, 0.0)
         return {
@@ -74,6 +79,9 @@ class FlightRecord:
             "scan_cells": mesh.scan_cells if mesh is not None else 0,
             "map_cells": mesh.map_cells if mesh is not None else 0,
             "bytes_sent": dict(mesh.bytes_sent) if mesh is not None else dict.fromkeys(SENT_KINDS, 0),
+            "receipts": _receipts(mesh),
+            "frame": mesh.settings.frame if mesh is not None else None,
+            "peers": _peers(places),
             "setpoints": self.setpoints,
             "decided_by": dict(self.decided_by),
             "failsafes": [_row(event) for event in self.events if event.kind == "failsafe"],
@@ -116,6 +124,23 @@ def write_map(path: Path, evidence: EvidenceMap) -> None:
             )
     except OSError as error:
         raise InputError(f"{path}: the map cannot be written: {error.strerror}") from error
+
+
+def _receipts(mesh: MeshNode | None) -> dict[str, dict[str, int]]:
+    """Return what the bytes of scans and tiles bought (`mesh_comm/receipts.py`), by kind; empty without mesh."""
+    return {} if mesh is None else {str(kind): asdict(receipt) for kind, receipt in mesh.receipts.items()}
+
+
+def _peers(places: PeerPlaces | None) -> list[dict[str, Any]]:
+    """Return every peer heard, by id: its standing at the end, and since when (seconds) its map counted."""
+    return [
+        {
+            "id": peer,
+            "standing": place.standing,
+            "placed_s": None if place.placed_s is None else round(place.placed_s, 3),
+        }
+        for peer, place in sorted((places.by_peer if places is not None else {}).items())
+    ]
 
 
 def _row(event: Event) -> dict[str, Any]:

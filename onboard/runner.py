@@ -27,6 +27,7 @@ from imagine.onboard.flight import Flight, FlightStep
 from imagine.onboard.ladder import STILL, Decider, Decision, Ladder, Order, Situation, Velocity
 from imagine.onboard.perception import Perception, PerceptionResult
 from imagine.onboard.phases import AIRBORNE, Phase
+from imagine.onboard.places import PeerPlaces
 from imagine.onboard.policy import Policy
 from imagine.onboard.policy_decisions import PolicyDecisions
 from imagine.onboard.records import Event, OdometryOut, RunnerStatus, Setpoint, Telemetry, TickInput, TickOutput
@@ -82,6 +83,7 @@ class Runner:
         self.visits = VisitMap() if sees_visits else None
         self.ladder = Ladder(settings.ladder, settings.max_flight_s)
         self.flight = Flight(settings.flight)
+        self.places = PeerPlaces()
         self._yaw_prior = YawPrior(settings.limits.yaw_rate_rps)
         self._where: PerceptionResult | None = None
         self._tracked_at: float | None = None
@@ -324,7 +326,9 @@ class Runner:
                 reason=status.reason,
             )
         )
-        return tuple(self.mesh.poll(inputs.now))
+        datagrams = tuple(self.mesh.poll(inputs.now))
+        self._events += self.places.observe(self.mesh, inputs.now)  # polling is when frames are found
+        return datagrams
 
     def _tell(self, now: float, kind: str, text: str) -> None:
         self._events.append(Event(now, kind, text))

@@ -3,6 +3,7 @@
 import { Link } from "./link.js";
 import { MapView } from "./map.js";
 import { Panel, bytes, clock } from "./cards.js";
+import { CellPanel } from "./cell.js";
 
 const byId = (id) => document.getElementById(id);
 const QUESTIONS = {
@@ -17,6 +18,8 @@ let phase = "connecting";
 
 const map = new MapView(byId("map"), showView);
 const panel = new Panel(byId("cards"), byId("events"), (id) => { map.setFollow(map.follow === id ? null : id); refresh(); });
+const cell = new CellPanel(byId("cell"), (at) => map.setPicked(at));
+map.onPick = (x, y) => cell.toggle(x, y, map.cell);
 const link = new Link({ onState, onAnswer, onChange });
 
 // what tests and scripts may rely on
@@ -25,7 +28,7 @@ window.imagineState = { connection: phase, knownCells: 0, coverage: null, drones
 function onState(next, first) {
   if (first) map.reset(); // a new connection starts from an empty map and gets everything
   state = next;
-  if (!next) { panel.clear(); map.draw(); refresh(); return; } // it runs, but has nothing to show yet
+  if (!next) { panel.clear(); cell.close(); map.draw(); refresh(); return; } // it runs, but has nothing to show yet
   map.update(next);
   panel.addEvents(next.events, first);
   refresh();
@@ -143,6 +146,7 @@ function send(verb) {
 }
 
 dialog.addEventListener("close", () => { if (dialog.returnValue === "yes" && asked) send(asked); asked = null; });
+document.addEventListener("keydown", (e) => { if (e.key === "Escape" && !dialog.open) cell.close(); });
 for (const button of document.querySelectorAll("[data-verb]")) button.addEventListener("click", () => ask(button.dataset.verb));
 byId("zoom-in").addEventListener("click", () => map.zoom(1.25));
 byId("zoom-out").addEventListener("click", () => map.zoom(0.8));

@@ -11,14 +11,19 @@ const EXPLAIN = {
   hold: "Hovers in place", land: "Descends to land", disarm: "Motors off",
 };
 const KINDS = ["scan", "tile", "digest", "status"];
+const PLACES = {
+  candidate: ["◎", "Being placed", "Its map seems to fit in one place; later evidence must bear that out before it is shown."],
+  unknown: ["◌", "Not placed", "Nobody knows yet where its map lies in this one: it is not shown."],
+};
 const EVENT_LIMIT = 200;
 
 export const bytes = (n) => (n < 1000 ? `${Math.round(n)} B` : n < 1e6 ? `${(n / 1e3).toFixed(1)} kB` : `${(n / 1e6).toFixed(2)} MB`);
 export const clock = (s) => `${Math.floor(s / 60)}:${String(Math.floor(s % 60)).padStart(2, "0")}`;
 const area = (cells, cell) => `${(cells * cell * cell).toFixed(1)} m²`;
-const seconds = (s) => (s < 60 ? `${s.toFixed(1)} s` : clock(s));
+const grouped = (n) => String(n).replace(/\B(?=(\d{3})+$)/g, "\u202f");
+export const seconds = (s) => (s < 60 ? `${s.toFixed(1)} s` : clock(s));
 
-function make(tag, attributes = {}, ...children) {
+export function make(tag, attributes = {}, ...children) {
   const node = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) name === "text" ? (node.textContent = value) : node.setAttribute(name, value);
   node.append(...children);
@@ -28,6 +33,11 @@ function make(tag, attributes = {}, ...children) {
 // only changed text is written, so that screen readers and selections are left in peace
 function write(node, text) { if (node.textContent !== text) node.textContent = text; }
 function mark(node, name, value) { if (node.getAttribute(name) !== String(value)) node.setAttribute(name, value); }
+
+function taught(d) {
+  const cells = (d.taught.scan ?? 0) + (d.taught.tile ?? 0), spent = (d.bytes_sent.scan ?? 0) + (d.bytes_sent.tile ?? 0);
+  return spent ? `${grouped(cells)} cells, ${(cells / spent).toFixed(1)} a byte` : "nothing yet";
+}
 
 class Card {
   constructor(id, onFollow) {
@@ -41,6 +51,9 @@ class Card {
     this.glyph = make("span", { class: "glyph", "aria-hidden": "true" });
     this.state = make("span", { "data-testid": `drone-${id}-state` });
     this.badge = make("span", { class: "badge" }, this.glyph, this.state);
+    this.placeGlyph = make("span", { class: "glyph", "aria-hidden": "true" });
+    this.placeText = make("span", { "data-testid": `drone-${id}-place` });
+    this.place = make("p", { class: "placing", hidden: "" }, make("span", { class: "badge place" }, this.placeGlyph, this.placeText));
     this.follow = make("button", { type: "button", class: "quiet", "aria-pressed": "false", "aria-label": `Follow drone ${id} on the map`, text: "Follow" });
     this.follow.addEventListener("click", () => onFollow(id));
     this.reason = make("p", { class: "reason", "data-testid": `drone-${id}-reason` });
@@ -51,12 +64,12 @@ class Card {
     this.kinds = make("dd", { class: "kinds" });
     this.root = make("article", { "data-testid": `drone-card-${id}`, "aria-label": `Drone ${id}` },
       make("header", {}, swatch, make("h3", { text: `Drone ${id}` }), this.badge, this.follow),
-      this.reason, this.note,
+      this.place, this.reason, this.note,
       make("dl", {},
         make("div", {}, make("dt", { text: "Battery" }), make("dd", { class: "battery" }, this.level, this.charge)),
         field("height", "Height"), field("speed", "Speed"), field("age", "Data age"),
         field("mode", "Mode", true), field("cells", "Own area"), field("hears", "Hears"),
-        field("radio", "Sent"), field("rate", "Rate"),
+        field("radio", "Sent"), field("rate", "Rate"), field("taught", "Taught its peers", true),
         make("div", { class: "wide" }, make("dt", { text: "Sent by kind" }), this.kinds)));
     this.id = id;
   }
@@ -72,6 +85,11 @@ class Card {
     const silent = d.stale ? `Not heard for ${Math.round(age)} s. It was last ${last}${d.reason ? `: ${d.reason}` : ""}.`
       : offline || null;
     write(this.reason, silent ?? (d.reason || EXPLAIN[d.state] || ""));
+    const unplaced = PLACES[d.place];
+    this.place.hidden = !unplaced;
+    if (unplaced) { write(this.placeGlyph, unplaced[0]); write(this.placeText, unplaced[1]); mark(this.place, "title", unplaced[2]); }
+    write(this.taught, taught(d));
+    mark(this.taught, "title", `${d.taught.scan ?? 0} cells by scans, ${d.taught.tile ?? 0} by tiles, for each byte of scans and tiles sent`);
     write(this.note, d.note);
     this.note.hidden = !d.note;
     write(this.charge, d.battery === null ? "unknown" : `${Math.round(d.battery * 100)}%${d.battery <= 0.2 ? " low" : ""}`);

@@ -8,6 +8,7 @@ const LIMIT = 8;
 const MIN_SCALE = 4, MAX_SCALE = 400, FIT_MAX_SCALE = 110;
 const FIT_MARGIN = [68, 28, 40, 58]; // left, right, top, bottom: room for the controls, pixels
 const TRAIL_LIMIT = 600;
+const CLICK_PX = 5;
 
 export const colourOf = (id) => PALETTE[(id - 1 + PALETTE.length * 32) % PALETTE.length];
 
@@ -27,6 +28,8 @@ export class MapView {
     this.view = { x: 0, y: 0, scale: 40 };
     this.auto = true;
     this.follow = null;
+    this.picked = null; // the cell asked about, by its centre
+    this.onPick = null;
     this.reset();
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.listen();
@@ -166,15 +169,22 @@ export class MapView {
 
   listen() {
     const c = this.canvas;
-    let drag = null;
+    let drag = null, dragged = false;
     c.addEventListener("wheel", (e) => { e.preventDefault(); this.zoom(Math.exp(-e.deltaY * 0.0015), e.offsetX, e.offsetY); }, { passive: false });
-    c.addEventListener("pointerdown", (e) => { drag = [e.clientX, e.clientY]; c.setPointerCapture(e.pointerId); c.classList.add("dragging"); });
+    c.addEventListener("pointerdown", (e) => { drag = [e.clientX, e.clientY]; dragged = false; c.setPointerCapture(e.pointerId); c.classList.add("dragging"); });
     c.addEventListener("pointermove", (e) => {
       this.cursor = this.mapPoint(e.offsetX, e.offsetY);
+      // a finger never lies quite still: what moves less is a click
+      if (drag && !dragged && Math.hypot(e.clientX - drag[0], e.clientY - drag[1]) < CLICK_PX) return;
+      dragged = Boolean(drag);
       if (drag) { this.pan(e.clientX - drag[0], e.clientY - drag[1]); drag = [e.clientX, e.clientY]; } else this.onMove?.();
     });
     const drop = () => { drag = null; c.classList.remove("dragging"); };
-    c.addEventListener("pointerup", drop);
+    c.addEventListener("pointerup", (e) => {
+      if (drag && !dragged && e.button === 0) this.onPick?.(...this.mapPoint(e.offsetX, e.offsetY));
+      drop();
+    });
+    for (const kind of ["focus", "blur"]) c.addEventListener(kind, () => this.draw());
     c.addEventListener("pointercancel", drop);
     c.addEventListener("pointerleave", () => { this.cursor = null; this.onMove?.(); });
     c.addEventListener("keydown", (e) => {
@@ -182,6 +192,7 @@ export class MapView {
       if (step) this.pan(...step);
       else if (e.key === "+" || e.key === "=") this.zoom(1.25);
       else if (e.key === "-") this.zoom(0.8);
+      else if (e.key === "Enter" || e.key === " ") this.onPick?.(this.view.x, this.view.y);
       else if (e.key === "f" || e.key === "F") this.setAuto(true);
       else return;
       e.preventDefault();
@@ -212,8 +223,26 @@ export class MapView {
     for (const d of this.drones) this.drawTrail(g, d);
     this.drawLinks(g);
     for (const d of this.drones) this.drawDrone(g, d);
+    this.drawPicked(g);
     this.onMove?.();
   }
+
+  // the cell asked about, and with the keyboard where Enter would ask
+  drawPicked(g) {
+    g.strokeStyle = "#ffffff";
+    g.lineWidth = 2;
+    if (this.picked) {
+      const size = Math.max(12, this.cell * this.view.scale + 4);
+      g.strokeRect(this.px(this.picked[0]) - size / 2, this.py(this.picked[1]) - size / 2, size, size);
+    }
+    if (!this.canvas.matches(":focus-visible")) return;
+    const x = this.px(this.view.x), y = this.py(this.view.y);
+    g.beginPath();
+    for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) { g.moveTo(x + 4 * dx, y + 4 * dy); g.lineTo(x + 10 * dx, y + 10 * dy); }
+    g.stroke();
+  }
+
+  setPicked(at) { this.picked = at; this.draw(); }
 
   drawGrid(g) {
     const step = [0.5, 1, 2, 5, 10, 20, 50].find((s) => s * this.view.scale >= 24) ?? 100;

@@ -12,6 +12,7 @@ from imagine.gcs.station import obey
 from imagine.mesh_comm.messages import Status
 from imagine.mesh_comm.node import MeshNode, MeshSettings
 from imagine.mesh_comm.seal import Sealer
+from imagine.mesh_comm.settings import Frame
 
 KEY = bytes(range(32))
 TICK_S = 0.1
@@ -23,10 +24,10 @@ LADDER = {"hold": "hold", "land": "land", "resume": "policy"}
 class Drone:
     """A drone that flies its path, maps, talks, and does what the pilot orders."""
 
-    def __init__(self, id_: int) -> None:
+    def __init__(self, id_: int, settings: MeshSettings) -> None:
         self.id = id_
         self.evidence = EvidenceMap(own=id_)
-        self.node = MeshNode(self.evidence, LD19, RANGE_CAP_M, MeshSettings(), Sealer(KEY, id_, 1))
+        self.node = MeshNode(self.evidence, LD19, RANGE_CAP_M, settings, Sealer(KEY, id_, 1))
         self.flown_m = 0.0
         self.ladder, self.reason = "policy", ""
         self.orders: list[str] = []
@@ -53,9 +54,10 @@ class Drone:
 class Swarm:
     """The drones, the ground, and the air between them; `run` lets simulated time pass and publishes the outcome."""
 
-    def __init__(self, server: GroundServer) -> None:
-        self.fleet = Fleet(MeshSettings(), Sealer(KEY, 0, 1), range_cap_m=RANGE_CAP_M)
-        self.drones = {i: Drone(i) for i in (1, 2, 3)}
+    def __init__(self, server: GroundServer, frame: Frame = "shared") -> None:
+        settings = MeshSettings(frame=frame)
+        self.fleet = Fleet(settings, Sealer(KEY, 0, 1), range_cap_m=RANGE_CAP_M)
+        self.drones = {i: Drone(i, settings) for i in (1, 2, 3)}
         self.server = server
         self.now = 0.0
 
