@@ -507,12 +507,12 @@ def test_nothing_is_noted_of_tiles_that_are_refused(tiles: Tiles) -> None:
     cells = pack_tile(np.ones((32, 32), np.int8))
     for source in (3, 4) if tiles.source == 1 else (3, 4, 5):
         drone.node.receive(_FORGER.seal(messages.encode(Tiles(source, [Tile(0, 0, 1, cells)])), 0.0), 0.0)
-    record, noted = drone.node._peers.live(0.0)[0], len(drone.node._exchange._sent)
+    record, noted = drone.node._state.peers.live(0.0)[0], len(drone.node._state.exchange._sent)
     before = dict(record.holdings)
     drone.node.receive(_FORGER.seal(messages.encode(tiles), 0.1), 0.1)
     assert drone.node.stats["content"] == 1
     assert record.holdings == before
-    assert len(drone.node._exchange._sent) == noted
+    assert len(drone.node._state.exchange._sent) == noted
 
 
 def test_what_newer_nodes_say_is_counted_and_hurts_nothing() -> None:
