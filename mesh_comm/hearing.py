@@ -30,11 +30,11 @@ class Hearing:
         except Rejected:
             return  # counted by the sealer
         try:
-            message = messages.decode(opened.payload)
+            message, newer = messages.read(opened.payload)
         except messages.Unreadable as error:
             self._drop(error.reason, opened.sender, error)
             return
-        if messages.newer_fields(opened.payload):
+        if newer:
             state.newer += 1
         try:
             self._take(message, opened, datagram, now)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import msgspec
 import numpy as np
 import pytest
@@ -508,7 +510,7 @@ def test_nothing_is_noted_of_tiles_that_are_refused(tiles: Tiles) -> None:
     for source in (3, 4) if tiles.source == 1 else (3, 4, 5):
         drone.node.receive(_FORGER.seal(messages.encode(Tiles(source, [Tile(0, 0, 1, cells)])), 0.0), 0.0)
     record, noted = drone.node._state.peers.live(0.0)[0], len(drone.node._state.exchange._sent)
-    before = dict(record.holdings)
+    before = copy.deepcopy(record.holdings)
     drone.node.receive(_FORGER.seal(messages.encode(tiles), 0.1), 0.1)
     assert drone.node.stats["content"] == 1
     assert record.holdings == before
