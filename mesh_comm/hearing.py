@@ -44,7 +44,8 @@ class Hearing:
     def _take(self, message: Message, opened: Opened, datagram: bytes, now: float) -> None:
         state, sender = self._state, opened.sender
         if isinstance(message, Command):
-            state.orders.take(message, sender, datagram)
+            if state.orders.take(message, sender, datagram):
+                state.dropped["old-life"] += 1
             return
         if sender == GROUND and not isinstance(message, Digest):
             raise InputError("the ground sends digests and commands only")

@@ -28,6 +28,8 @@ GROUND = 0
 POSITION_LIMIT_M = MAX_TILES * TILE * CELL / 2
 """A position further than this from the origin cannot be in any map and is refused."""
 MAX_BEAMS = 4096
+MOST_NAMED = 96
+"""Drones that one order names at most, 7 bytes each: it fits a datagram with the ground's signature."""
 MAX_RANGE_CAP_M = 30.0
 MAX_SPEED_MPS = 50.0
 _MAX_HEIGHT_M = 1000.0
@@ -133,12 +135,14 @@ class Status(Struct, tag=4, array_like=True, frozen=True):
 class Command(Struct, tag=5, array_like=True, frozen=True):
     """An order from the ground: `action` is hold, land or resume; `target` 0 means all.
 
-    `nonce` grows with every order, so a repeated or relayed copy is obeyed once.
+    `nonce` grows with every order, so a repeated or relayed copy is obeyed once. `starts` names the drones that are
+    meant, each with the boot number of its present start: no recording can name a start that was yet to come.
     """
 
     action: Tag
     target: NodeId
     nonce: Annotated[int, Meta(ge=1, le=2**53)]
+    starts: Annotated[dict[SourceId, Boot], Meta(max_length=MOST_NAMED)] = {}
 
 
 ACTIONS = ("hold", "land", "resume")

@@ -75,7 +75,9 @@ class MeshNode:
     def send_command(self, action: str, target: int, now: float) -> int:
         """Order drone `target` (0: all) to hold, land or resume; return the order's nonce.
 
-        The order is repeated for a while, and drones pass it on. Only the ground may; raises InputError otherwise.
+        The order is repeated for a while, and drones pass it on. It names the present start of each drone that it is
+        for, so drones that are not known of yet get it once they are, if it is still repeated then. Only the ground
+        may; raises InputError otherwise.
         """
         return self._state.orders.issue(action, target, now)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from imagine.core.evidence import EvidenceMap
 from imagine.core.frames import IDENTITY, Pose, inverse, transform_points
 from imagine.mesh_comm.map_inbox import MapInbox
+from imagine.mesh_comm.messages import GROUND
 from imagine.mesh_comm.orders import Orders
 from imagine.mesh_comm.peer_book import PeerBook
 from imagine.mesh_comm.placement import Placements
@@ -51,6 +52,17 @@ class NodeState:
         """Return the number of the latest start of a node that is known of, 0 where none is."""
         layer = self.evidence.layers.get(source)
         return max(self.peers.boot(source), 0 if layer is None else layer.boot)
+
+    def starts(self) -> dict[int, int]:
+        """Return the latest start of every drone that is known of, by id: heard itself, or its map is held.
+
+        By this node, or by a peer as its digests tell: so also of drones that only drones in reach have heard.
+        """
+        latest = self.peers.starts()
+        for source, layer in self.evidence.layers.items():
+            if layer.boot > 0:
+                latest[source] = max(latest.get(source, 0), layer.boot)
+        return {id_: boot for id_, boot in latest.items() if id_ not in (GROUND, self.id)}
 
     def not_walls(self, scanner: int, now: float) -> NDArray[np.float64]:
         """Return where a scan of peer `scanner` sees drones, `[n, 2]` metres in its frame: teammates and this one."""

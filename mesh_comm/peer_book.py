@@ -49,6 +49,14 @@ class PeerBook:
         record = self._records.get(id_)
         return 0 if record is None else record.boot
 
+    def starts(self) -> dict[int, int]:
+        """Return the latest start of everyone ever heard, and of those whose maps they hold, by id."""
+        latest = {id_: record.boot for id_, record in self._records.items()}
+        for record in self._records.values():
+            for source, held in record.holdings.items():
+                latest[source] = max(latest.get(source, 0), held.boot)
+        return latest
+
     def is_live(self, id_: int, now: float) -> bool:
         """Tell whether a peer was heard lately."""
         record = self._records.get(id_)

@@ -138,9 +138,11 @@ class Speaking:
             out.append(relays.popleft())
             self.bytes_sent["status"] += len(out[-1])
         for repeat in self._state.orders.due(now):
-            if not self._send(repeat.command, "status", out, now):
+            named = repeat.commands(self._state.starts())
+            if not all(self._send(command, "status", out, now) for command in named):
                 return False
-            self._state.orders.note_sent(repeat, now)
+            if named:  # else it waits until a target is heard of
+                self._state.orders.note_sent(repeat, now)
         return True
 
     def _send_status(self, out: list[bytes], now: float) -> bool:
