@@ -1,6 +1,8 @@
-"""Numba kernels that write what peers send into their layers: marks of a scan ahead of its tiles, and tiles."""
+"""Numba kernels that write what peers send into their layers: scans without teammates, ahead of tiles, and tiles."""
 
 from __future__ import annotations
+
+import math
 
 import numba
 import numpy as np
@@ -49,3 +51,26 @@ def write_tile(cells, versions, provisional, row, column, version, tile):  # typ
     versions[row, column] = version
     provisional[row, column] = False
     return 1
+
+
+@numba.njit(cache=True, nogil=True)
+def mask_targets(ranges, start, increment, range_max, pose, targets, radius):  # type: ignore[no-untyped-def]
+    """Return `ranges` (float32 `[beams]`, metres) without returns on `targets`, as `lidar.mask_near` does, in one pass.
+
+    Beam i looks along `start + i increment` off the heading of `pose` (metres, radians); `targets` float64 `[n, 2]`.
+    """
+    x, y, yaw = pose
+    out = ranges.copy()
+    for k in range(len(targets)):
+        east, north = targets[k, 0] - x, targets[k, 1] - y
+        away = math.hypot(east, north)
+        if away > range_max + radius:
+            continue
+        for beam in range(len(ranges)):
+            measured = np.float64(ranges[beam])
+            if abs(measured - away) < radius + 1e-3:  # only a return about as far away can be on it
+                bearing = start + yaw + beam * increment
+                off_x, off_y = measured * math.cos(bearing) - east, measured * math.sin(bearing) - north
+                if off_x * off_x + off_y * off_y < radius * radius:
+                    out[beam] = np.nan
+    return out

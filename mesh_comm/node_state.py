@@ -71,5 +71,5 @@ class NodeState:
             return np.zeros((0, 2))
         others = self.peers.positions(now, leave_out=scanner)
         if self.pose is not None:
-            others = np.vstack((others, [self.pose[:2]]))
+            others = np.concatenate((others, (self.pose[:2],)))
         return others if frame == IDENTITY else transform_points(inverse(frame), others)

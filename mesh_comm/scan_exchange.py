@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from imagine.core.evidence import EvidenceMap
 from imagine.core.frames import Pose
-from imagine.core.lidar import LidarSpec, Scan, mask_near
+from imagine.core.lidar import LidarSpec, Scan
+from imagine.core.peer_marks import mask_targets
 from imagine.core.raster import CELL, TILE
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.codec import pack_ranges, unpack_ranges
@@ -48,12 +49,15 @@ def draw_peer_scan(
     evidence.cover(pose.x - reach, pose.y - reach, pose.x + reach, pose.y + reach)
     layer = evidence.layer(message.sender)
     corner, side = evidence.corner, CELL * TILE
-    row0, row1 = (math.floor(y / side) - corner.row for y in (pose.y - reach, pose.y + reach))
-    column0, column1 = (math.floor(x / side) - corner.column for x in (pose.x - reach, pose.x + reach))
+    row0, row1 = math.floor((pose.y - reach) / side) - corner.row, math.floor((pose.y + reach) / side) - corner.row
+    column0, column1 = (
+        math.floor((pose.x - reach) / side) - corner.column, math.floor((pose.x + reach) / side) - corner.column,
+    )  # fmt: skip
     if layer.versions[row0 : row1 + 1, column0 : column1 + 1].min() >= message.clock:
         return  # every tile in reach contains this scan
     spec = _sensor(message.beams, message.increment, message.start, cap)
-    ranges = mask_near(ranges, spec, pose, teammates, mask_radius_m)
+    if len(teammates):
+        ranges = mask_targets(ranges, spec.start, spec.increment, spec.range_max, pose, teammates, mask_radius_m)
     evidence.integrate_provisional(message.sender, pose, Scan(message.stamp, ranges), spec, cap, message.clock)
 
 
