@@ -21,8 +21,11 @@ from numpy.typing import NDArray
 from imagine.core.errors import InputError
 from imagine.core.frames import IDENTITY, Pose
 from imagine.core.lidar import LidarSpec, Scan
+from imagine.core.peer_marks import add_marks_ahead, write_tile
 from imagine.core.placed_layer import PlacedLayer
-from imagine.core.raster import CELL, LIMIT, TILE, integrate_scan, sum_layers
+from imagine.core.raster import CELL, TILE, beam_directions, integrate_scan, mark_scan, ray_table, sum_layers
+
+_NEVER = 2**40  # no version is so late
 
 MAX_TILES = 160
 """Largest extent any map may be given, in tiles along an axis (512 m)."""
@@ -129,20 +132,35 @@ class EvidenceMap:
             layer.versions[touched] = layer.clock
         return changed
 
-    def integrate_provisional(self, source: int, pose: Pose, scan: Scan, spec: LidarSpec, range_cap_m: float) -> int:
-        """Draw a peer's scan into the peer's layer ahead of its tiles; the tiles it changes turn provisional."""
+    def integrate_provisional(
+        self, source: int, pose: Pose, scan: Scan, spec: LidarSpec, range_cap_m: float, clock: int | None = None
+    ) -> int:
+        """Draw a peer's scan into the peer's layer ahead of its tiles; the tiles it changes turn provisional.
+
+        Tiles of version `clock` or later contain the scan already and are left alone.
+        """
         if source == self.own:
             raise InputError(f"source {source} is this drone itself: its scans are not a peer's")
-        changed, touched = self._draw(source, pose, scan, spec, range_cap_m)
-        self.layers[source].provisional |= touched
-        return changed
+        self._cover_scan(pose, range_cap_m)
+        layer = self.layer(source)
+        column0, row0 = self.origin_cells
+        table = ray_table(range_cap_m)
+        marks = np.empty(table.sheet, np.int8)
+        first_row, first_column = mark_scan(
+            marks, pose.x, pose.y, pose.yaw, beam_directions(spec.start, spec.increment, len(scan.ranges)),
+            scan.ranges, spec.range_min, range_cap_m, table.starts, table.offsets,
+        )  # fmt: skip
+        newest = _NEVER if clock is None else clock
+        return int(
+            add_marks_ahead(
+                layer.cells, layer.versions, layer.provisional, newest, marks, first_row - row0, first_column - column0
+            )
+        )
 
     def _draw(
         self, source: int, pose: Pose, scan: Scan, spec: LidarSpec, range_cap_m: float
     ) -> tuple[int, NDArray[np.bool_]]:
-        if not all(map(math.isfinite, pose)):
-            raise InputError(f"pose {tuple(pose)} is not finite")
-        self.cover(pose.x - range_cap_m, pose.y - range_cap_m, pose.x + range_cap_m, pose.y + range_cap_m)
+        self._cover_scan(pose, range_cap_m)
         layer = self.layer(source)
         touched = np.zeros((self.tile_rows, self.tile_columns), np.bool_)
         column0, row0 = self.origin_cells
@@ -151,6 +169,11 @@ class EvidenceMap:
             pose.x, pose.y, pose.yaw, spec.start, spec.increment, scan.ranges, spec.range_min, range_cap_m,
         )  # fmt: skip
         return int(changed), touched
+
+    def _cover_scan(self, pose: Pose, range_cap_m: float) -> None:
+        if not all(map(math.isfinite, pose)):
+            raise InputError(f"pose {tuple(pose)} is not finite")
+        self.cover(pose.x - range_cap_m, pose.y - range_cap_m, pose.x + range_cap_m, pose.y + range_cap_m)
 
     def tile(self, source: int, key: TileKey) -> NDArray[np.int8]:
         """Return the cells of one tile of a source's layer, int8 `[TILE, TILE]`; a view, zeros where unheld."""
@@ -188,18 +211,17 @@ class EvidenceMap:
             raise InputError(f"a tile of source {source} came from outside, but only drone {source} writes it")
         if cells.shape != (TILE, TILE) or cells.dtype != np.int8:
             raise InputError(f"a tile is int8 {TILE}x{TILE}, got {cells.dtype} {cells.shape}")
-        if not 1 <= version < 2**32 or cells.max() > LIMIT or cells.min() < -LIMIT:
-            raise InputError(f"tile {tuple(key)} of source {source}: version {version} or its cells are out of range")
+        if not 1 <= version < 2**32:
+            raise InputError(f"tile {tuple(key)} of source {source}: version {version} is out of range")
         self._cover_tiles(key.column, key.row, key.column, key.row)
         layer = self.layer(source)
         row, column = key.row - self.corner.row, key.column - self.corner.column
-        if version <= layer.versions[row, column]:
-            return False
-        self.tile(source, key)[:] = cells
-        layer.versions[row, column] = version
-        layer.provisional[row, column] = False
-        layer.clock = max(layer.clock, version)
-        return True
+        taken = write_tile(layer.cells, layer.versions, layer.provisional, row, column, version, cells)
+        if taken < 0:
+            raise InputError(f"tile {tuple(key)} of source {source}: its cells are out of range")
+        if taken:
+            layer.clock = max(layer.clock, version)
+        return bool(taken)
 
     def place(self, source: int, pose: Pose | None) -> None:
         """Say where a source's frame lies in the drone's own (metres, radians), or (None) that it is not known.
@@ -225,6 +247,11 @@ class EvidenceMap:
 
         The grid may grow to hold a layer in its new place; what lies beyond the largest extent is left out.
         """
+        if not self._placed:  # all that count lie in the own frame as they are
+            frames, unplaced = self._placements, IDENTITY if self.shares_frame else None
+            return {
+                source: layer.cells for source, layer in self.layers.items() if frames.get(source, unplaced) is not None
+            }
         stale = {
             source: placed
             for source, placed in self._placed.items()
@@ -265,12 +292,18 @@ class EvidenceMap:
         )
 
     def _cover_tiles(self, column_min: int, row_min: int, column_max: int, row_max: int) -> None:
-        low = TileKey(min(column_min, self.corner.column), min(row_min, self.corner.row))
+        column, row = self.corner
+        if (
+            column_min >= column
+            and row_min >= row
+            and column_max < column + self.tile_columns
+            and row_max < row + self.tile_rows
+        ):
+            return
+        low = TileKey(min(column_min, column), min(row_min, row))
         high_column = max(column_max + 1, self.corner.column + self.tile_columns)
         high_row = max(row_max + 1, self.corner.row + self.tile_rows)
         rows, columns = high_row - low.row, high_column - low.column
-        if low == self.corner and (rows, columns) == (self.tile_rows, self.tile_columns):
-            return
         if rows > self._max_tiles or columns > self._max_tiles:
             raise InputError(
                 f"the map would grow to {columns}x{rows} tiles, over the limit of {self._max_tiles} "

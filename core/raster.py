@@ -196,7 +196,7 @@ def apply_marks(cells, marks, row0, column0, touched):  # type: ignore[no-untype
             tile_column = column0 // TILE + j
             if not 0 <= tile_column < tile_columns:
                 continue
-            differing = _add(cells, first, last, tile_column * TILE, marks, first - row0, j * TILE)
+            differing = add_marks(cells, first, last, tile_column * TILE, marks, first - row0, j * TILE)
             if differing > 0:
                 touched[tile_row, tile_column] = True
                 changed += differing
@@ -204,7 +204,7 @@ def apply_marks(cells, marks, row0, column0, touched):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, nogil=True)
-def _add(cells, first, last, column, marks, mark_row, mark_column):  # type: ignore[no-untyped-def]
+def add_marks(cells, first, last, column, marks, mark_row, mark_column):  # type: ignore[no-untyped-def]
     """Add a tile's width of marks to rows first to last of the cells; return how many changed."""
     changed = np.int64(0)
     for i in range(last - first):

@@ -6,8 +6,9 @@ bytes, however damaged, take more time or memory to read than sound ones.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ from imagine.mesh_comm.version_model import (
 )
 
 _CHANCES = load_chances()
+_AS_KEY = partial(tuple.__new__, TileKey)  # TileKey._make without Python's part of it: lists are long
 _SPARE_BYTES = 8  # what the coder wants free behind its last byte
 _MOST_BEAM_BYTES = 24  # no step takes more than 11 bits: two of kind, 12 and 11 of a size up to 3000, one of sign
 _MOST_ENTRY_BYTES = 192  # three numbers, each of at most 40 steps that learn, and 39 digits
@@ -103,15 +105,15 @@ def pack_versions(versions: Mapping[TileKey, int]) -> bytes:
 
 def unpack_versions(packed: bytes) -> dict[TileKey, int]:
     """Return the tile versions of `pack_versions`. Raises InputError on bytes that tell no list."""
-    data, zeros, state = np.frombuffer(packed, np.uint8), _even_odds(VERSION_CONTEXTS), np.empty(4, np.int64)
-    count = int(decode_count(data, zeros, state))
+    data, zeros = np.frombuffer(packed, np.uint8), np.empty(VERSION_CONTEXTS, np.int64)
+    count, state = decode_count(data, zeros)
     if count > min(TILES_A_BYTE * (len(packed) + 1), MOST_LISTED):
         raise InputError(f"mesh version list: {len(packed)} bytes claim to tell of {count} tiles")
     entries = np.empty((count, 3), np.int64)
     if not decode_entries(data, zeros, state, entries):
         raise InputError(f"mesh version list: {len(packed)} bytes do not tell of {count} tiles that a map can hold")
-    keys = map(TileKey._make, entries[:, :2].tolist())
-    return dict(zip(keys, entries[:, 2].tolist(), strict=True))
+    columns, rows, versions = entries.T.tolist()
+    return dict(zip(map(_AS_KEY, zip(columns, rows, strict=True)), versions, strict=True))
 
 
 @lru_cache(maxsize=8)
@@ -128,7 +130,7 @@ def _metres(range_cap: float) -> NDArray[np.float32]:
 
 def largest_code(range_cap: float) -> int:
     """Return the greatest code of a range up to `range_cap` metres."""
-    return int(np.floor(range_cap / RANGE_STEP_M + 1e-9)) + FIRST_RANGE
+    return math.floor(range_cap / RANGE_STEP_M + 1e-9) + FIRST_RANGE
 
 
 def _even_odds(contexts: int) -> NDArray[np.int64]:

@@ -19,7 +19,7 @@ class Held(NamedTuple):
     """What is held of a source: the number of its start that all of it is of, and tile versions."""
 
     boot: int
-    versions: Mapping[TileKey, int]
+    versions: dict[TileKey, int]
 
 
 def digests(stamp: float, held: Mapping[int, Held], max_bytes: int) -> list[Digest]:

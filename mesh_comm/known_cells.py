@@ -3,35 +3,62 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from imagine.core.evidence import EvidenceMap, TileKey
-from imagine.core.frames import IDENTITY, placed_bounds
+from imagine.core.frames import IDENTITY, Pose, placed_bounds
 from imagine.core.raster import CELL, TILE
 
-
-@numba.njit(cache=True, nogil=True)
-def _add(total, cells, row0, column0):  # type: ignore[no-untyped-def]
-    """Add to `total` (int16 `[rows, columns]`) as many of `cells` (int8), from (row0, column0) on."""
-    for i in range(total.shape[0]):
-        for j in range(total.shape[1]):
-            total[i, j] += np.int16(cells[np.uintp(row0 + i), np.uintp(column0 + j)])
+_KNOWN, _CANDIDATE = 1, 2
 
 
 @numba.njit(cache=True, nogil=True)
-def _claim_known(total, known, row0, column0):  # type: ignore[no-untyped-def]
-    """Mark what is not zero in `total` in `known`, from (row0, column0) on; return how many cells were not before."""
-    fresh = np.int64(0)
-    for i in range(total.shape[0]):
-        row_fresh = np.int16(0)
-        for j in range(total.shape[1]):
-            row, column = np.uintp(row0 + i), np.uintp(column0 + j)
-            is_fresh = (total[i, j] != 0) & ~known[row, column]
-            row_fresh += np.int16(is_fresh)
-            known[row, column] |= is_fresh
-        fresh += np.int64(row_fresh)
+def _find(cells, known, places, rows, columns, found, count):  # type: ignore[no-untyped-def]
+    """Add to `found` (int32, flat) the cells of rectangles that have evidence in `cells` (int8) and are not known.
+
+    They become candidates in `known` (uint8 `[rows, columns]`, zero where nothing is known), so that each is found
+    once. `places` int64 `[n, 2]`: row and column of the first cell of each rectangle of `rows` by `columns` cells.
+    Return how many there are in `found`, of which `count` were there before.
+    """
+    width = known.shape[1]
+    for k in range(len(places)):
+        column0 = places[k, 1]
+        for i in range(rows):
+            row = places[k, 0] + i
+            line, known_line = cells[np.uintp(row)], known[np.uintp(row)]
+            is_any = np.int8(0)
+            for j in range(columns):  # bytes and no branches: this compiles to vector instructions
+                column = np.uintp(column0 + j)
+                is_any |= np.int8(line[column] != 0) & np.int8(known_line[column] == 0)
+            if is_any:
+                for j in range(columns):
+                    if line[column0 + j] != 0 and known_line[column0 + j] == 0:
+                        known_line[column0 + j] = _CANDIDATE
+                        found[count] = row * width + column0 + j
+                        count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(total, cells, found, count):  # type: ignore[no-untyped-def]
+    """Add to `total` (int16) the evidence of `cells` on each of the first `count` cells found."""
+    flat = cells.ravel()
+    for k in range(count):
+        total[k] += np.int16(flat[found[k]])
+
+
+@numba.njit(cache=True, nogil=True)
+def _claim_found(total, known, found, count):  # type: ignore[no-untyped-def]
+    """Make candidates known where `total` is not zero, and unknown again where it is; return how many are known now."""
+    flat = known.ravel()
+    fresh = 0
+    for k in range(count):
+        flat[found[k]] = _KNOWN if total[k] != 0 else 0
+        fresh += 1 if total[k] != 0 else 0
     return fresh
 
 
@@ -44,8 +71,9 @@ class KnownCells:
     def __init__(self, evidence: EvidenceMap) -> None:
         """Start with nothing known."""
         self._evidence = evidence
+        self._corner = evidence.corner
         self._origin = evidence.origin_cells
-        self._known = np.zeros(evidence.shape, np.bool_)
+        self._known = np.zeros(evidence.shape, np.uint8)
 
     def claim_around(self, x: float, y: float, reach_m: float) -> int:
         """Return how many cells of a square around (x, y), metres, have become known since the last claim on them."""
@@ -53,14 +81,25 @@ class KnownCells:
         row0, row1 = math.floor((y - reach_m) / CELL), math.floor((y + reach_m) / CELL) + 1
         return self._claim(column0, row0, column1, row1)
 
-    def claim_tile(self, source: int, key: TileKey) -> int:
-        """Return how many cells where a source's tile lies have become known since the last claim on them."""
+    def claim_tiles(self, source: int, keys: Sequence[TileKey]) -> int:
+        """Return how many cells where a source's tiles lie have become known since the last claim on them."""
         pose = self._evidence.placement(source)
         if pose is None:
             return 0  # it is no part of the belief
+        if pose != IDENTITY:
+            return sum(self._claim_placed(pose, key) for key in keys)
+        layers = self._evidence.placed()
+        self._follow_growth()
+        corner, rows, columns = self._corner, self._evidence.tile_rows, self._evidence.tile_columns
+        places = [
+            (row * TILE, column * TILE)
+            for row, column in ((key.row - corner.row, key.column - corner.column) for key in keys)
+            if 0 <= row < rows and 0 <= column < columns
+        ]
+        return self._claim_places(layers, np.array(places, np.int64).reshape(-1, 2), TILE, TILE)
+
+    def _claim_placed(self, pose: Pose, key: TileKey) -> int:
         column, row = key.column * TILE, key.row * TILE
-        if pose == IDENTITY:
-            return self._claim(column, row, column + TILE, row + TILE)
         x, y = (column * CELL, (column + TILE) * CELL), (row * CELL, (row + TILE) * CELL)
         least, most = placed_bounds(pose, x, y)
         low, high = np.floor(least / CELL - 1.0).astype(int), np.ceil(most / CELL + 1.0).astype(int)
@@ -81,16 +120,34 @@ class KnownCells:
         rows, columns = self._known.shape
         first_row, last_row = max(row0 - row, 0), min(max(row1 - row, 0), rows)
         first_column, last_column = max(column0 - column, 0), min(max(column1 - column, 0), columns)
-        total = np.zeros((max(0, last_row - first_row), max(0, last_column - first_column)), np.int16)
+        if first_row >= last_row or first_column >= last_column:
+            return 0
+        place = np.array([[first_row, first_column]], np.int64)
+        return self._claim_places(layers, place, last_row - first_row, last_column - first_column)
+
+    def _claim_places(
+        self, layers: Mapping[int, NDArray[np.int8]], places: NDArray[np.int64], rows: int, columns: int
+    ) -> int:
+        """Claim rectangles of the grid that do not overlap, each with its first cell at one of `places`."""
+        # few cells become known by a message: only on those is the evidence of all sources added up
+        found = np.empty(len(places) * rows * columns, np.int32)
+        count = 0
         for cells in layers.values():
-            _add(total, cells, first_row, first_column)
-        return int(_claim_known(total, self._known, first_row, first_column))
+            count = _find(cells, self._known, places, rows, columns, found, count)
+        if count == 0:
+            return 0
+        total = np.zeros(count, np.int16)
+        for cells in layers.values():
+            _add(total, cells, found, count)
+        return int(_claim_found(total, self._known, found, count))
 
     def _follow_growth(self) -> None:
-        origin, shape = self._evidence.origin_cells, self._evidence.shape
-        if origin == self._origin and shape == self._known.shape:
+        corner = self._evidence.corner
+        if corner is self._corner:  # the map makes a new one when it grows
             return
-        grown = np.zeros(shape, np.bool_)
+        self._corner = corner
+        origin, shape = self._evidence.origin_cells, self._evidence.shape
+        grown = np.zeros(shape, np.uint8)
         column, row = self._origin[0] - origin[0], self._origin[1] - origin[1]
         rows, columns = self._known.shape
         grown[row : row + rows, column : column + columns] = self._known

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
-from imagine.core.evidence import EvidenceMap
+from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import IDENTITY, Pose, compose
 from imagine.core.raster import CELL
 from imagine.mesh_comm import messages
@@ -76,15 +76,20 @@ class MapInbox:
         unpacked = [unpack_tile(tile.packed) for tile in message.tiles]
         if not self.renew(message.source, message.boot):
             return
-        for tile, cells in zip(message.tiles, unpacked, strict=True):
-            key = tile_key(tile)
-            if is_source_near and self._evidence.is_provisional(message.source, key):
-                continue
-            if self._own_counted != self._own_clock:
-                self.own_cells += self._known.claim_tile(message.source, key)
-            if self._exchange.merge(message.source, tile, cells):
-                self._provenance.note_tile(message.source, key, tile.version, via, now)
-                self.map_cells += self._known.claim_tile(message.source, key)
+        if self._own_counted != self._own_clock:
+            self.own_cells += self._known.claim_tiles(message.source, list({tile_key(tile) for tile in message.tiles}))
+        taken: dict[TileKey, None] = {}
+        try:
+            for tile, cells in zip(message.tiles, unpacked, strict=True):
+                key = tile_key(tile)
+                if is_source_near and self._evidence.is_provisional(message.source, key):
+                    continue
+                if self._exchange.merge(message.source, tile, cells):
+                    self._provenance.note_tile(message.source, key, tile.version, via, now)
+                    taken[key] = None
+        finally:  # a tile too far away to hold ends a message, and those before it are taken
+            if taken:
+                self.map_cells += self._known.claim_tiles(message.source, list(taken))
 
     def note_placed(self) -> None:
         """Count what became known because a peer's map found its place, as cells that its tiles made known."""

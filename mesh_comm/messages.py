@@ -28,6 +28,8 @@ GROUND = 0
 POSITION_LIMIT_M = MAX_TILES * TILE * CELL / 2
 """A position further than this from the origin cannot be in any map and is refused."""
 MAX_BEAMS = 4096
+MOST_NAMED = 96
+"""Drones that one order names at most, 7 bytes each: it fits a datagram with the ground's signature."""
 MAX_RANGE_CAP_M = 30.0
 MAX_SPEED_MPS = 50.0
 _MAX_HEIGHT_M = 1000.0
@@ -133,12 +135,14 @@ class Status(Struct, tag=4, array_like=True, frozen=True):
 class Command(Struct, tag=5, array_like=True, frozen=True):
     """An order from the ground: `action` is hold, land or resume; `target` 0 means all.
 
-    `nonce` grows with every order, so a repeated or relayed copy is obeyed once.
+    `nonce` grows with every order, so a repeated or relayed copy is obeyed once. `starts` names the drones that are
+    meant, each with the boot number of its present start: no recording can name a start that was yet to come.
     """
 
     action: Tag
     target: NodeId
     nonce: Annotated[int, Meta(ge=1, le=2**53)]
+    starts: Annotated[dict[SourceId, Boot], Meta(max_length=MOST_NAMED)] = {}
 
 
 ACTIONS = ("hold", "land", "resume")
@@ -176,46 +180,47 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes) -> Message:
-    """Read and check a message.
+    """Read and check a message; raises Unreadable as `read` does."""
+    return read(data)[0]
+
+
+def read(data: bytes) -> tuple[Message, int]:
+    """Read and check a message; return it, and how many fields it has beyond those of its kind that are known here.
 
     Raises Unreadable on another version, on an unknown kind, and on anything truncated, malformed, or out of bounds.
     """
     if not data or data[0] != WIRE_VERSION:
         version = data[0] if data else "none"
         raise Unreadable("wire-version", f"mesh message of wire version {version}, expected {WIRE_VERSION}")
-    kind, _ = _array(data)
-    if kind is not None and kind not in _FIELDS:
+    kind, fields = _array(data)
+    known = fields if kind is None else _FIELDS.get(kind)
+    if known is None:
         raise Unreadable("unknown-kind", f"mesh message of kind {kind}, known are {', '.join(map(str, _FIELDS))}")
     try:
         message = _decoder.decode(memoryview(data)[1:])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Unreadable("malformed", f"mesh message cannot be read: {error}") from error
     _check(message)
-    return message
-
-
-def newer_fields(data: bytes) -> int:
-    """Return how many fields a sound message has, beyond those of its kind that are known here."""
-    kind, fields = _array(data)
-    return max(0, fields - _FIELDS[kind]) if kind in _FIELDS else 0
+    return message, max(0, fields - known)
 
 
 def _array(data: bytes) -> tuple[int | None, int]:
     """Return the kind of a message, None where it has none, and how many elements its array has."""
-    match data[1:2]:
-        case b"":
-            return None, 0
-        case b"\xdc":
-            fields, at = int.from_bytes(data[2:4], "big"), 4
-        case b"\xdd":
-            fields, at = int.from_bytes(data[2:6], "big"), 6
-        case header:
-            fields, at = (header[0] & 0x0F if header[0] & 0xF0 == 0x90 else 0), 2
-    if data[at : at + 1] == b"\xcc":  # a byte of its own for numbers from 128
+    size = len(data)
+    header = data[1] if size > 1 else 0
+    if header & 0xF0 == 0x90:
+        fields, at = header & 0x0F, 2
+    elif header == 0xDC:
+        fields, at = int.from_bytes(data[2:4], "big"), 4
+    elif header == 0xDD:
+        fields, at = int.from_bytes(data[2:6], "big"), 6
+    else:
+        return None, 0
+    if at < size and data[at] == 0xCC:  # a byte of its own for numbers from 128
         at += 1
-    elif data[at : at + 1] >= b"\x80":
+    elif at < size and data[at] >= 0x80:
         return None, fields
-    return (data[at] if fields > 0 and at < len(data) else None), fields
+    return (data[at] if fields > 0 and at < size else None), fields
 
 
 def tile_key(tile: Tile) -> TileKey:
@@ -242,14 +247,16 @@ def _check(message: Message) -> None:
                 raise Unreadable(
                     "malformed", f"mesh scan: start {message.start} rad, range cap {message.range_cap_m} m"
                 )
-            _check_bounds("scan: stamp", _MAX_TIME_S, message.stamp)
+            _check_bound("scan: stamp", _MAX_TIME_S, message.stamp)
         case Status():
             _check_pose(message.pose)
-            _check_bounds("status: time", _MAX_TIME_S, message.stamp, *message.links.values())
-            _check_bounds("status: velocity", MAX_SPEED_MPS, *message.velocity, math.hypot(*message.velocity))
-            _check_bounds("status: height", _MAX_HEIGHT_M, message.height_m)
+            _check_bound("status: time", _MAX_TIME_S, message.stamp)
+            for age_s in message.links.values():
+                _check_bound("status: time", _MAX_TIME_S, age_s)
+            _check_bound("status: velocity", MAX_SPEED_MPS, math.hypot(*message.velocity))
+            _check_bound("status: height", _MAX_HEIGHT_M, message.height_m)
         case Digest():
-            _check_bounds("digest: stamp", _MAX_TIME_S, message.stamp)
+            _check_bound("digest: stamp", _MAX_TIME_S, message.stamp)
         case Command():
             if message.action not in ACTIONS:
                 raise Unreadable("malformed", f"mesh command '{message.action}', expected one of {', '.join(ACTIONS)}")
@@ -257,13 +264,15 @@ def _check(message: Message) -> None:
             pass  # each tile's cells are checked when they are unpacked
 
 
-def _check_bounds(what: str, most: float, *values: float) -> None:
-    if not all(abs(value) <= most for value in values):  # nan is not, either
-        raise Unreadable(
-            "malformed", f"mesh {what} {', '.join(map(str, values))}, expected at most {most:g} either way"
-        )
+def _check_bound(what: str, most: float, value: float) -> None:
+    if not -most <= value <= most:  # nan is not, either
+        raise Unreadable("malformed", f"mesh {what} {value}, expected at most {most:g} either way")
 
 
 def _check_pose(pose: Pose) -> None:
-    _check_bounds("pose: position", POSITION_LIMIT_M, pose.x, pose.y)
-    _check_bounds("pose: yaw", _MAX_YAW_RAD, pose.yaw)
+    x, y, yaw = pose
+    if abs(x) <= POSITION_LIMIT_M and abs(y) <= POSITION_LIMIT_M and abs(yaw) <= _MAX_YAW_RAD:
+        return
+    _check_bound("pose: position", POSITION_LIMIT_M, pose.x)
+    _check_bound("pose: position", POSITION_LIMIT_M, pose.y)
+    _check_bound("pose: yaw", _MAX_YAW_RAD, pose.yaw)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from imagine.core.errors import InputError
-from imagine.mesh_comm.messages import ACTIONS, GROUND, Command
+from imagine.mesh_comm.messages import ACTIONS, GROUND, MOST_NAMED, Command
 
 _PERIOD_S = 0.25
 _EPSILON_S = 1e-6
@@ -15,23 +15,36 @@ _EPSILON_S = 1e-6
 
 @dataclass
 class Repeat:
-    """An order that the ground is still repeating; times in seconds."""
+    """An order that the ground is still repeating, to drone `target` or (0) to all; times in seconds."""
 
-    command: Command
+    action: str
+    target: int
+    nonce: int
     next_at: float
     until: float
+
+    def commands(self, starts: Mapping[int, int]) -> list[Command]:
+        """Return the order as it is sent, when the drones that are known are in `starts`: boot numbers by id.
+
+        It names its targets among them, in as many messages as that takes; none where no target is known yet.
+        """
+        named = sorted((id_, boot) for id_, boot in starts.items() if self.target in (GROUND, id_))
+        return [
+            Command(self.action, self.target, self.nonce, dict(named[first : first + MOST_NAMED]))
+            for first in range(0, len(named), MOST_NAMED)
+        ]
 
 
 class Orders:
     """A node's side of the orders: the ground issues and repeats them, a drone takes them and passes them on."""
 
     def __init__(self, own: int, boot: int, repeat_s: float) -> None:
-        """Start with no orders; `boot` makes the ground's nonces grow across its restarts."""
+        """Start with no orders; by `boot` a drone knows those for this start, and the ground's nonces grow."""
         self.last_nonce = 0
         """Nonce of the last order taken, 0 before any."""
         self.relays: deque[bytes] = deque(maxlen=16)
         """Sealed orders still to be passed on, as they came."""
-        self._own = own
+        self._own, self._boot = own, boot
         self._repeat_s = repeat_s
         self._issued = boot << 20
         self._repeats: list[Repeat] = []
@@ -45,8 +58,8 @@ class Orders:
             raise InputError(f"command '{action}' to {target}: expected {', '.join(ACTIONS)} and a target of 0 to 254")
         self._issued += 1
         # an older order to the same drones must not be heard again after this one
-        self._repeats = [repeat for repeat in self._repeats if target not in (GROUND, repeat.command.target)]
-        self._repeats.append(Repeat(Command(action, target, self._issued), now, now + self._repeat_s))
+        self._repeats = [repeat for repeat in self._repeats if target not in (GROUND, repeat.target)]
+        self._repeats.append(Repeat(action, target, self._issued, now, now + self._repeat_s))
         return self._issued
 
     def due(self, now: float) -> Iterator[Repeat]:
@@ -58,18 +71,25 @@ class Orders:
         """Set when an order that just went out is repeated."""
         repeat.next_at = now + _PERIOD_S
 
-    def take(self, command: Command, sender: int, datagram: bytes) -> None:
-        """Take an order a drone heard. Raises InputError if it is not the ground's.
+    def take(self, command: Command, sender: int, datagram: bytes) -> bool:
+        """Take an order that was heard; tell whether it is for another start of this drone. Raises InputError.
 
         It is passed on as it came under every protocol: a pilot's order must reach drones out of the ground's reach.
-        The seal proves that it is the ground's, and the replay window ends the flood.
+        The seal proves that it is the ground's, and the replay window ends the flood. But a drone that has just started
+        has no window yet, and what it hears may be a recording: it obeys only what names its own start.
         """
         if sender != GROUND or self._own == GROUND:
             raise InputError("a command that is not from the ground")
         self.relays.append(datagram)
-        if command.target in (GROUND, self._own) and command.nonce > self.last_nonce:
+        if command.target not in (GROUND, self._own):
+            return False
+        boot = command.starts.get(self._own)
+        if boot is None and (command.target == self._own or not command.starts):
+            raise InputError("a command that does not name the start of the drone that it is for")
+        if boot == self._boot and command.nonce > self.last_nonce:
             self.last_nonce = command.nonce
             self._taken.append(command)
+        return boot is not None and boot != self._boot
 
     def drain(self) -> list[Command]:
         """Return the orders taken since the last call, oldest first."""

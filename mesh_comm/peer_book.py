@@ -28,13 +28,14 @@ class PeerBook:
         """Start with nobody heard."""
         self._settings = settings
         self._frame_of = frame_of
-        self._records: dict[int, PeerRecord] = {}
+        self._records: dict[int, PeerRecord] = {}  # by id, in order
 
     def hear(self, opened: Opened, now: float) -> PeerRecord:
         """Note that a peer was heard, and return its record."""
         record = self._records.get(opened.sender)
         if record is None:
             record = self._records[opened.sender] = PeerRecord(opened.sender, opened.boot, now)
+            self._records = dict(sorted(self._records.items()))
         if record.boot != opened.boot:
             _log.warning("mesh peer %d has restarted", opened.sender)
             record.restart(opened.boot)
@@ -48,6 +49,14 @@ class PeerBook:
         record = self._records.get(id_)
         return 0 if record is None else record.boot
 
+    def starts(self) -> dict[int, int]:
+        """Return the latest start of everyone ever heard, and of those whose maps they hold, by id."""
+        latest = {id_: record.boot for id_, record in self._records.items()}
+        for record in self._records.values():
+            for source, held in record.holdings.items():
+                latest[source] = max(latest.get(source, 0), held.boot)
+        return latest
+
     def is_live(self, id_: int, now: float) -> bool:
         """Tell whether a peer was heard lately."""
         record = self._records.get(id_)
@@ -55,7 +64,8 @@ class PeerBook:
 
     def live(self, now: float) -> list[PeerRecord]:
         """Return the records of the live peers, by id."""
-        return [record for id_, record in sorted(self._records.items()) if self.is_live(id_, now)]
+        timeout_s = self._settings.peer_timeout_s
+        return [record for record in self._records.values() if now - record.heard_at <= timeout_s]
 
     def map_listeners(self, now: float) -> list[PeerRecord]:
         """Return the live peers that take scans and tiles under the protocol: the ground always does."""
@@ -69,7 +79,7 @@ class PeerBook:
         """Return everyone ever heard as the outside sees them, by id."""
         return {
             id_: Peer(id_, max(0.0, now - r.heard_at), self.is_live(id_, now), *self._placed(r), r.status)
-            for id_, r in sorted(self._records.items())
+            for id_, r in self._records.items()
         }
 
     def ages(self, now: float, most: int) -> dict[int, float]:
@@ -81,8 +91,10 @@ class PeerBook:
         """Return where the live peers should be by now, `[n, 2]` metres, own frame; without those of unknown frames."""
         places = []
         for record in self.live(now):
+            if record.id == leave_out:
+                continue
             place, frame = record.position(now), self._frame_of(record.id)
-            if record.id == leave_out or place is None or frame is None:
+            if place is None or frame is None:
                 continue
             places.append(place if frame == IDENTITY else transform_points(frame, np.array([place]))[0])
         return np.array(places, np.float64).reshape(-1, 2)

@@ -70,9 +70,9 @@ class PeerRecord:
         """
         if digest.stamp < self.digest_stamp:
             return
-        lists = [(holding, _versions(holding)) for holding in digest.holdings]
-        if len({holding.source for holding in digest.holdings} | set(self.holdings)) > max_sources + 1:
+        if len({holding.source for holding in digest.holdings} | self.holdings.keys()) > max_sources + 1:
             raise InputError(f"mesh digest of {self.id} makes more than {max_sources} sources")
+        lists = [(holding, _versions(holding)) for holding in digest.holdings]
         for holding, versions in lists:
             known = self.holdings.get(holding.source)
             if known is None or known.boot != holding.boot:
@@ -87,10 +87,11 @@ class PeerRecord:
         """Take it that the peer holds tiles, because it sent them."""
         known = self.holdings.get(source)
         if known is None or known.boot < boot:
-            known = Held(boot, {})
+            known = self.holdings[source] = Held(boot, {})
         if known.boot == boot:
-            newer = {key: max(version, known.versions.get(key, 0)) for key, version in versions.items()}
-            self.holdings[source] = Held(boot, {**known.versions, **newer})
+            for key, version in versions.items():
+                if version > known.versions.get(key, 0):
+                    known.versions[key] = version
 
     def holds(self, source: int, boot: int, key: TileKey) -> float:
         """Return the version of a tile of a source's start that the peer is known to hold: 0 for none.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +46,8 @@ class CellProvenance:
     sightings: tuple[Sighting, ...]
 
 
-@dataclass
-class _Arrival:
-    """How a tile of a source came: the copy held, and the newest scan on it."""
+class _Arrival(NamedTuple):
+    """How one tile of a source came: the copy held, and the newest scan on it."""
 
     version: int = 0
     via: int = 0
@@ -57,26 +56,54 @@ class _Arrival:
     scan_at: float | None = None
 
 
+class _Arrivals:
+    """How every tile of a source came, as arrays `[tile rows, tile columns]` on the map's grid; nan: nothing did."""
+
+    def __init__(self, corner: TileKey, tile_rows: int, tile_columns: int) -> None:
+        shape = tile_rows, tile_columns
+        self.corner = corner
+        self.version = np.zeros(shape, np.int64)
+        self.via = np.zeros(shape, np.uint8)
+        self.tile_at, self.stamp, self.scan_at = np.full((3, *shape), np.nan)
+
+    def copy_from(self, old: _Arrivals) -> None:
+        """Take over what is noted on a smaller grid."""
+        row, column = old.corner.row - self.corner.row, old.corner.column - self.corner.column
+        rows, columns = old.version.shape
+        for name in ("version", "via", "tile_at", "stamp", "scan_at"):
+            getattr(self, name)[row : row + rows, column : column + columns] = getattr(old, name)
+
+    def at(self, key: TileKey) -> _Arrival:
+        """Return how a tile came."""
+        row, column = key.row - self.corner.row, key.column - self.corner.column
+        if not (0 <= row < self.version.shape[0] and 0 <= column < self.version.shape[1]):
+            return _Arrival()
+        tile_at, stamp, scan_at = (
+            None if math.isnan(value) else value
+            for value in map(float, (self.tile_at[row, column], self.stamp[row, column], self.scan_at[row, column]))
+        )
+        return _Arrival(int(self.version[row, column]), int(self.via[row, column]), tile_at, stamp, scan_at)
+
+
 class Provenance:
-    """How every tile of every source came here. As many records as the map holds tiles, which bounds them."""
+    """How every tile of every source came here. One record for each tile of the map's grid, which bounds them."""
 
     def __init__(self, evidence: EvidenceMap) -> None:
         """Start with nothing heard."""
         self._evidence = evidence
-        self._arrivals: dict[int, dict[TileKey, _Arrival]] = {}
+        self._arrivals: dict[int, _Arrivals] = {}
         self._own_clock = 0
 
     def note_own(self, stamp: float, now: float) -> None:
         """Take it that the own layer's newest tiles were changed by a scan of this stamp, seconds."""
-        evidence = self._evidence
-        layer = evidence.layers[evidence.own]
+        own = self._evidence.own
+        layer = self._evidence.layers[own]
         if layer.clock == self._own_clock:
             return
-        for row, column in np.argwhere(layer.versions > self._own_clock):
-            key = TileKey(int(column) + evidence.corner.column, int(row) + evidence.corner.row)
-            arrival = self._arrival(evidence.own, key)
-            arrival.version, arrival.via = int(layer.versions[row, column]), evidence.own
-            arrival.stamp, arrival.scan_at = stamp, now
+        arrivals, changed = self._of(own), layer.versions > self._own_clock
+        arrivals.version[changed] = layer.versions[changed]
+        arrivals.via[changed] = own
+        arrivals.stamp[changed], arrivals.scan_at[changed] = stamp, now
         self._own_clock = layer.clock
 
     def note_scan(self, source: int, x: float, y: float, reach_m: float, stamp: float, now: float) -> None:
@@ -86,19 +113,32 @@ class Provenance:
         column = max(0, math.floor((x - reach_m) / side) - corner.column)
         last_row = max(0, math.floor((y + reach_m) / side) - corner.row)
         last_column = max(0, math.floor((x + reach_m) / side) - corner.column)
-        provisional = self._evidence.layers[source].provisional[row : last_row + 1, column : last_column + 1]
-        for i, j in np.argwhere(provisional).tolist():
-            arrival = self._arrival(source, TileKey(column + j + corner.column, row + i + corner.row))
-            arrival.stamp, arrival.scan_at = stamp, now
+        reached = slice(row, last_row + 1), slice(column, last_column + 1)
+        provisional = self._evidence.layers[source].provisional[reached]
+        arrivals = self._of(source)
+        np.copyto(arrivals.stamp[reached], stamp, where=provisional)
+        np.copyto(arrivals.scan_at[reached], now, where=provisional)
 
     def note_tile(self, source: int, key: TileKey, version: int, via: int, now: float) -> None:
         """Note a tile that was taken into the map, heard from node `via`."""
-        arrival = self._arrival(source, key)
-        arrival.version, arrival.via, arrival.tile_at = version, via, now
+        arrivals = self._of(source)
+        at = key.row - arrivals.corner.row, key.column - arrivals.corner.column
+        arrivals.version[at], arrivals.via[at], arrivals.tile_at[at] = version, via, now
 
     def forget(self, source: int) -> None:
         """Drop what is noted of a source, whose layer was dropped."""
         self._arrivals.pop(source, None)
+
+    def _of(self, source: int) -> _Arrivals:
+        """Return what is noted of a source, on the grid as it is now."""
+        evidence, arrivals = self._evidence, self._arrivals.get(source)
+        if arrivals is not None and arrivals.corner is evidence.corner:  # the map makes a new one when it grows
+            return arrivals
+        grown = _Arrivals(evidence.corner, evidence.tile_rows, evidence.tile_columns)
+        if arrivals is not None:
+            grown.copy_from(arrivals)
+        self._arrivals[source] = grown
+        return grown
 
     def at(self, x: float, y: float) -> CellProvenance:
         """Return where the belief in the cell at (x, y), metres of the own frame, comes from; nothing off the map."""
@@ -125,7 +165,8 @@ class Provenance:
             at = transform_points(inverse(pose), at)
         side = CELL * TILE
         key = TileKey(math.floor(at[0, 0] / side), math.floor(at[0, 1] / side))
-        arrival = self._arrivals.get(source, {}).get(key, _Arrival())
+        arrivals = self._arrivals.get(source)
+        arrival = _Arrival() if arrivals is None else arrivals.at(key)
         provisional = evidence.is_provisional(source, key)
         if source == evidence.own:
             return Sighting(source, units, "own scan", source, arrival.version, arrival.stamp, arrival.scan_at, False)
@@ -133,10 +174,3 @@ class Provenance:
             return Sighting(source, units, "scan", source, arrival.version, arrival.stamp, arrival.scan_at, provisional)
         way: Way = "tile" if arrival.via == source else "relay"
         return Sighting(source, units, way, arrival.via, arrival.version, arrival.stamp, arrival.tile_at, provisional)
-
-    def _arrival(self, source: int, key: TileKey) -> _Arrival:
-        arrivals = self._arrivals.setdefault(source, {})
-        arrival = arrivals.get(key)
-        if arrival is None:
-            arrival = arrivals[key] = _Arrival()
-        return arrival

@@ -2,10 +2,9 @@
 
 The coder of Martin (1979) in the byte-wise form that LZMA made common. What a model says is a list of steps, each
 `2 context + bit`; a table holds for each context the chance that its bit is zero, of 65536 (`ONE`). Context 0 is even
-odds always. With `learns` the table follows what was seen. State is int64 `[4]`: of an encoder low, range and the place
-in the buffer; of a decoder code, range, place and how many bytes there are. Behind the last byte a decoder reads zeros,
-so an encoder drops zeros at the end. What damaged bytes decode to is some other content: integrity is the seal's
-business.
+odds always. With `learns` the table follows what was seen. A decoder's state is (code, range, place in the bytes),
+handed on as numbers so that they stay in registers. Behind the last byte a decoder reads zeros, so an encoder drops
+zeros at the end. What damaged bytes decode to is some other content: integrity is the seal's business.
 """
 
 from __future__ import annotations
@@ -100,52 +99,54 @@ def _finish(out, place, low, span):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def start_decoder(data, state):  # type: ignore[no-untyped-def]
-    """Make `state` that of a decoder at the beginning of `data`, uint8."""
-    state[0], state[1], state[2], state[3] = 0, _WORD_MASK, 4, len(data)
+def start_decoder(data):  # type: ignore[no-untyped-def]
+    """Return the state of a decoder at the beginning of `data`, uint8."""
+    code = np.int64(0)
     for at in range(4):
-        state[0] = (state[0] << 8) | (np.int64(data[at]) if at < len(data) else 0)
+        code = (code << 8) | (np.int64(data[at]) if at < len(data) else np.int64(0))
+    return code, np.int64(_WORD_MASK), np.int64(4)
 
 
 @numba.njit(cache=True, nogil=True)
 def decode_bit(data, state, zero):  # type: ignore[no-untyped-def]
-    """Return the next bit, whose chance of being zero is `zero` of `ONE`."""
-    bound = (state[1] * zero) >> 16
-    if state[0] < bound:
-        state[1] = bound
-        bit = 0
+    """Return the next bit, whose chance of being zero is `zero` of `ONE`, and the state after it."""
+    code, span, place = state
+    bound = (span * zero) >> 16
+    if code < bound:
+        span = bound
+        bit = np.int64(0)
     else:
-        state[0] -= bound
-        state[1] -= bound
-        bit = 1
-    while state[1] < _TOP:
-        state[0] <<= 8
-        if state[2] < state[3]:
-            state[0] |= np.int64(data[np.uint64(state[2])])
-        state[2] += 1
-        state[1] <<= 8
-    return bit
+        code -= bound
+        span -= bound
+        bit = np.int64(1)
+    while span < _TOP:
+        code <<= 8
+        if place < len(data):
+            code |= np.int64(data[np.uint64(place)])
+        place += 1
+        span <<= 8
+    return bit, (code, span, place)
 
 
 @numba.njit(cache=True, nogil=True)
 def decode_learnt(data, state, zeros, context):  # type: ignore[no-untyped-def]
-    """Return the next bit, by the chance `zeros[context]`, which learns; for contexts from 1 on."""
-    zero = zeros[context]
-    bit = decode_bit(data, state, zero)
-    zeros[context] = _learnt(zero, bit)
-    return bit
+    """Return the next bit, by the chance `zeros[context]`, which learns, and the state; for contexts from 1 on."""
+    zero = zeros[np.uint64(context)]
+    bit, state = decode_bit(data, state, zero)
+    zeros[np.uint64(context)] = _learnt(zero, bit)
+    return bit, state
 
 
 @numba.njit(cache=True, nogil=True)
-def is_used_up(state):  # type: ignore[no-untyped-def]
+def is_used_up(data, state):  # type: ignore[no-untyped-def]
     """Tell whether a decoder that has read its last bit has no bytes left over."""
-    return state[3] <= state[2]
+    return len(data) <= state[2]
 
 
 @numba.njit(cache=True, nogil=True)
 def has_only_zeros_left(data, state):  # type: ignore[no-untyped-def]
     """Tell whether what a decoder has not read of `data` are zeros, if anything."""
-    for at in range(state[2], state[3]):  # numba compiles no generators  # noqa: SIM110
+    for at in range(state[2], len(data)):  # numba compiles no generators  # noqa: SIM110
         if data[at] != 0:
             return False
     return True
@@ -177,15 +178,18 @@ def number_steps(value, first, steps, at):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def decode_number(data, state, zeros, first):  # type: ignore[no-untyped-def]
-    """Return a number that was written as `number_steps`, by chances that learn."""
-    length = 0
-    while length < LONGEST_BITS - 1 and decode_learnt(data, state, zeros, first + length) == 1:
+    """Return a number that was written as `number_steps`, by chances that learn, and the state after it."""
+    length, more = np.int64(0), np.int64(1)
+    while length < LONGEST_BITS - 1:
+        more, state = decode_learnt(data, state, zeros, first + length)
+        if more == 0:
+            break
         length += 1
-    value = 1
+    value = np.int64(1)
     for k in range(length - 1, -1, -1):
         if k == length - 1:
-            bit = decode_learnt(data, state, zeros, first + LONGEST_BITS + length)
+            bit, state = decode_learnt(data, state, zeros, first + LONGEST_BITS + length)
         else:
-            bit = decode_bit(data, state, ONE // 2)
+            bit, state = decode_bit(data, state, ONE // 2)
         value = (value << 1) | bit
-    return value - 1
+    return value - 1, state

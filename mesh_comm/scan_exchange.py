@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine.core.evidence import EvidenceMap
 from imagine.core.frames import Pose
-from imagine.core.lidar import LidarSpec, Scan, mask_near
+from imagine.core.lidar import LidarSpec, Scan
+from imagine.core.peer_marks import mask_targets
 from imagine.core.raster import CELL, TILE
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.codec import pack_ranges, unpack_ranges
@@ -41,28 +43,25 @@ def draw_peer_scan(
     Raises InputError on damaged ranges and on a pose whose surroundings no map can hold.
     """
     cap = message.range_cap_m
-    fov = min(message.increment * message.beams, 2.0 * math.pi)
-    spec = LidarSpec(message.beams, fov, range_min=0.0, range_max=cap + 1.0, start=message.start)
     ranges = unpack_ranges(message.packed, message.beams, cap)
     pose = message.pose
-    ranges = mask_near(ranges, spec, pose, teammates, mask_radius_m)
-
     reach = cap + 2 * CELL
     evidence.cover(pose.x - reach, pose.y - reach, pose.x + reach, pose.y + reach)
     layer = evidence.layer(message.sender)
     corner, side = evidence.corner, CELL * TILE
-    row0, row1 = (math.floor(y / side) - corner.row for y in (pose.y - reach, pose.y + reach))
-    column0, column1 = (math.floor(x / side) - corner.column for x in (pose.x - reach, pose.x + reach))
-    contains = layer.versions[row0 : row1 + 1, column0 : column1 + 1] >= message.clock
-    if contains.all():
+    row0, row1 = math.floor((pose.y - reach) / side) - corner.row, math.floor((pose.y + reach) / side) - corner.row
+    column0, column1 = (
+        math.floor((pose.x - reach) / side) - corner.column, math.floor((pose.x + reach) / side) - corner.column,
+    )  # fmt: skip
+    if layer.versions[row0 : row1 + 1, column0 : column1 + 1].min() >= message.clock:
         return  # every tile in reach contains this scan
-    newer = [(row0 + row, column0 + column) for row, column in np.argwhere(contains).tolist()] if contains.any() else []
-    kept = [(at, layer.cells[_cells(*at)].copy(), layer.provisional[at]) for at in newer]
-    evidence.integrate_provisional(message.sender, pose, Scan(message.stamp, ranges), spec, cap)
-    for at, cells, provisional in kept:
-        layer.cells[_cells(*at)] = cells
-        layer.provisional[at] = provisional
+    spec = _sensor(message.beams, message.increment, message.start, cap)
+    if len(teammates):
+        ranges = mask_targets(ranges, spec.start, spec.increment, spec.range_max, pose, teammates, mask_radius_m)
+    evidence.integrate_provisional(message.sender, pose, Scan(message.stamp, ranges), spec, cap, message.clock)
 
 
-def _cells(row: int, column: int) -> tuple[slice, slice]:
-    return slice(row * TILE, (row + 1) * TILE), slice(column * TILE, (column + 1) * TILE)
+@lru_cache(maxsize=64)
+def _sensor(beams: int, increment: float, start: float, range_cap_m: float) -> LidarSpec:
+    fov = min(increment * beams, 2.0 * math.pi)
+    return LidarSpec(beams, fov, range_min=0.0, range_max=range_cap_m + 1.0, start=start)

@@ -107,29 +107,31 @@ def decode_scan(data, zeros, most, codes):  # type: ignore[no-untyped-def]
 
     `zeros` int64 `[SCAN_CONTEXTS]` learn. Takes time by the beams whatever the bytes.
     """
-    state = np.empty(4, np.int64)
-    start_decoder(data, state)
+    state = start_decoder(data)
     track = np.zeros(5, np.int64)
     track[0] = most << _FRACTION
     before, last, is_hit = _HIT, _HIT, False
     for beam in range(len(codes)):
         context = KINDS + 2 * (3 * last + before)
         kind = last
-        if decode_learnt(data, state, zeros, context) == 1:
+        is_other, state = decode_learnt(data, state, zeros, context)
+        if is_other == 1:
             lower, upper = 1 if last == 0 else 0, 1 if last == 2 else 2
-            kind = lower if decode_learnt(data, state, zeros, context + 1) == 0 else upper
+            is_upper, state = decode_learnt(data, state, zeros, context + 1)
+            kind = lower if is_upper == 0 else upper
         code = kind
         if kind == _HIT:
             rough = _roughness(track[2], track[3]) if is_hit else _AFTER_GAP
-            difference = decode_number(data, state, zeros, SIZES + rough * NUMBER_CONTEXTS)
+            difference, state = decode_number(data, state, zeros, SIZES + rough * NUMBER_CONTEXTS)
             if difference > most:
                 return False
-            if difference != 0 and decode_learnt(data, state, zeros, SIGNS + 3 * rough + track[4]) == 1:
-                difference = -difference
+            if difference != 0:
+                is_below, state = decode_learnt(data, state, zeros, SIGNS + 3 * rough + track[4])
+                difference = -difference if is_below == 1 else difference
             code = _prediction(track, most) + difference
             if code < FIRST_RANGE or code > most:
                 return False
             _follow(track, difference, code)
         codes[beam] = code
         before, last, is_hit = last, kind, kind == _HIT
-    return is_used_up(state)
+    return is_used_up(data, state)

@@ -120,9 +120,8 @@ def decode_tile(data, zeros, cells):  # type: ignore[no-untyped-def]
 
     `zeros` int64 `[TILE_CONTEXTS]`. Takes the same time and memory whatever the bytes; no cell is beyond ±LIMIT.
     """
-    state = np.empty(4, np.int64)
-    start_decoder(data, state)
-    if decode_bit(data, state, zeros[PLAIN]) == 1:
+    is_plain, state = decode_bit(data, start_decoder(data), zeros[PLAIN])
+    if is_plain == 1:
         return _decode_plain(data, state, cells)
     above = np.zeros(TILE + 1, np.int64)  # classes: of the row above, and of this row as far as it is read
     west = np.int64(0)
@@ -138,30 +137,34 @@ def decode_tile(data, zeros, cells):  # type: ignore[no-untyped-def]
             else:
                 n = nw = ne = w
             context = DIFFERS + ((w * CLASSES + n) * CLASSES + nw) * CLASSES + ne
-            if decode_bit(data, state, zeros[context]) == 1:
-                west = _decode_other(data, state, zeros, west, w, n, ne)
+            differs, state = decode_bit(data, state, zeros[np.uint64(context)])
+            if differs == 1:
+                west, state = _decode_other(data, state, zeros, west, w, n, ne)
                 w = _class(west)
             cells[i, j] = west
             above[j] = w
             nw = n
-    return is_used_up(state)
+    return is_used_up(data, state)
 
 
 @numba.njit(cache=True, nogil=True)
 def _decode_other(data, state, zeros, west, w, n, ne):  # type: ignore[no-untyped-def]
-    """Return a cell that differs from W."""
+    """Return a cell that differs from W, and the state after it."""
     pair = w * CLASSES + n
     context = CANDIDATES + pair * CLASSES + ne
     for candidate in (-LIMIT, 0, LIMIT):
-        if candidate != west and decode_bit(data, state, zeros[context]) == 1:
-            return np.int64(candidate)
+        if candidate != west:
+            is_it, state = decode_bit(data, state, zeros[np.uint64(context)])
+            if is_it == 1:
+                return np.int64(candidate), state
         context += CLASSES**3
-    is_positive = decode_bit(data, state, zeros[SIGN + pair])
+    is_positive, state = decode_bit(data, state, zeros[SIGN + pair])
     tree = SIZES + (is_positive * CLASSES**2 + pair) * 8
-    node = 1
+    node = np.int64(1)
     for _ in range(3):
-        node = 2 * node + decode_bit(data, state, zeros[tree + node])
-    return np.int64(node - 8 if is_positive == 1 else 8 - node)
+        digit, state = decode_bit(data, state, zeros[tree + node])
+        node = 2 * node + digit
+    return np.int64(node - 8 if is_positive == 1 else 8 - node), state
 
 
 @numba.njit(cache=True, nogil=True)
@@ -171,8 +174,9 @@ def _decode_plain(data, state, cells):  # type: ignore[no-untyped-def]
         for j in range(TILE):
             code = 0
             for _ in range(_PLAIN_BITS):
-                code = 2 * code + decode_bit(data, state, ONE // 2)
+                digit, state = decode_bit(data, state, ONE // 2)
+                code = 2 * code + digit
             if code > 2 * LIMIT:
                 return False
             cells[i, j] = code - LIMIT
-    return is_used_up(state)
+    return is_used_up(data, state)

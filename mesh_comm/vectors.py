@@ -58,7 +58,7 @@ def samples() -> list[tuple[int, Message]]:
         (SENDER, Digest(2.5, [Holding(1, None, None, pack_versions(held)), Holding(2, (-1, 4), None, b"")])),
         (SENDER, status),
         (SENDER, Status(SENDER, 2.5, _POSE)),
-        (GROUND, Command("land", 0, 2**40)),
+        (GROUND, Command("land", 0, 2**40, {SENDER: BOOT})),
     ]
 
 

@@ -14,6 +14,7 @@ from imagine.core.evidence import MAX_TILES
 from imagine.mesh_comm.range_coder import (
     MOST_NUMBER_STEPS,
     NUMBER_CONTEXTS,
+    ONE,
     decode_number,
     has_only_zeros_left,
     number_steps,
@@ -67,31 +68,37 @@ def version_steps(entries, steps):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def decode_count(data, zeros, state):  # type: ignore[no-untyped-def]
-    """Begin to read a list from `data` (uint8); return how many tiles it claims to hold."""
-    start_decoder(data, state)
-    return decode_number(data, state, zeros, _COUNT)
+def decode_count(data, zeros):  # type: ignore[no-untyped-def]
+    """Begin to read a list from `data` (uint8); return how many tiles it claims to hold, and the decoder's state.
+
+    `zeros` int64 `[VERSION_CONTEXTS]` become even odds, and learn.
+    """
+    zeros[:] = ONE // 2
+    return decode_number(data, start_decoder(data), zeros, _COUNT)
 
 
 @numba.njit(cache=True, nogil=True)
 def decode_entries(data, zeros, state, entries):  # type: ignore[no-untyped-def]
     """Read `entries` (int64 `[count, 3]`) behind the count; return whether they are sorted, in bounds, and the last.
 
-    `zeros` int64 `[VERSION_CONTEXTS]` learn.
+    `zeros` and `state` as `decode_count` left them.
     """
     column, row, first_row, version = -BIAS, np.int64(0), np.int64(0), np.int64(0)
     for k in range(len(entries)):
-        column_step = decode_number(data, state, zeros, _COLUMN)
+        column_step, state = decode_number(data, state, zeros, _COLUMN)
         before = row
         if column_step > 0:
-            row = first_row + _unzigzag(decode_number(data, state, zeros, _ROW))
+            step, state = decode_number(data, state, zeros, _ROW)
+            row = first_row + _unzigzag(step)
             first_row = row
         else:
-            row += _unzigzag(decode_number(data, state, zeros, _ROW_AFTER))
+            step, state = decode_number(data, state, zeros, _ROW_AFTER)
+            row += _unzigzag(step)
             if k > 0 and row <= before:
                 return False
         column += column_step
-        version += _unzigzag(decode_number(data, state, zeros, _VERSION))
+        step, state = decode_number(data, state, zeros, _VERSION)
+        version += _unzigzag(step)
         if abs(column) > MAX_TILES or abs(row) > MAX_TILES or version < 0 or version >= 1 << 32:
             return False
         entries[k, 0], entries[k, 1], entries[k, 2] = column, row, version

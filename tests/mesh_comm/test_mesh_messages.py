@@ -26,7 +26,7 @@ from imagine.mesh_comm.messages import (
     Unreadable,
     decode,
     encode,
-    newer_fields,
+    read,
 )
 
 HERE = Pose(1.5, -2.25, 0.5)
@@ -36,7 +36,7 @@ SAMPLES = [
     Digest(1.0, [Holding(1, None, (3, 4), b"a"), Holding(1, (3, 4), None, b"b")]),
     Digest(1.0, []),
     Status(4, 1.0, HERE, (0.5, 0.0), 1.2, 0.8, "OFFBOARD", True, "policy", "", 1, 2, 3, {"scan": 9}, {0: 0.1}, 5, 6),
-    Command("land", 0, 2**52),
+    Command("land", 0, 2**52, {1: 2**32 - 1, 254: 0}),
 ]
 
 
@@ -71,14 +71,14 @@ def wire(*fields: object) -> bytes:
 
 
 def test_fields_a_newer_sender_appends_are_ignored_and_those_an_older_leaves_out_have_defaults() -> None:
-    newer = wire(5, "hold", 2, 3, "a field from the future", [1, 2])
-    assert decode(newer) == Command("hold", 2, 3)
-    assert newer_fields(newer) == 2
+    newer = wire(5, "hold", 2, 3, {2: 7}, "a field from the future", [1, 2])
+    assert decode(newer) == Command("hold", 2, 3, {2: 7})
+    assert read(newer)[1] == 2
     assert decode(wire(2, 3, [[-2, 5, 9, b"cells", "more of a tile"]])) == Tiles(3, [Tile(-2, 5, 9, b"cells")])
     older = wire(4, 1, 0.5, list(HERE))
     assert decode(older) == Status(1, 0.5, HERE)
-    assert newer_fields(older) == 0
-    assert [newer_fields(encode(message)) for message in SAMPLES] == [0] * len(SAMPLES)
+    assert read(older)[1] == 0
+    assert [read(encode(message))[1] for message in SAMPLES] == [0] * len(SAMPLES)
 
 
 def test_fields_appended_to_a_long_message_are_counted() -> None:
@@ -86,7 +86,7 @@ def test_fields_appended_to_a_long_message_are_counted() -> None:
     assert len(status) > 15  # a longer form of array
     longer = wire(*status, 7, None, "x")
     assert decode(longer) == SAMPLES[4]
-    assert newer_fields(longer) == 3
+    assert read(longer)[1] == 3
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import msgspec
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from imagine.mesh_comm import messages
 from imagine.mesh_comm.codec import pack_tile, unpack_ranges
 from imagine.mesh_comm.messages import MAX_DATAGRAM, Digest, Status, Tile, Tiles
 from imagine.mesh_comm.node import MeshNode, MeshSettings
+from imagine.mesh_comm.orders import Orders
 from imagine.mesh_comm.seal import Sealer
 
 QUICK = settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -353,15 +356,72 @@ def test_cells_are_credited_once_and_to_the_first() -> None:
 
 def test_orders_reach_everyone_once_even_beyond_the_grounds_reach() -> None:
     ground, a, b = (make_drone(i) for i in (0, 1, 2))
-    first = ground.node.send_command("hold", 0, 0.0)
-    exchange([ground, a, b], ticks(0.0, 3.0), chain)
+    for now in ticks(0.0, 2.0):
+        b.fly(Pose(0.5, 0.1 * now, 0.0), now)  # so that a holds of its map, and tells the ground
+        exchange([ground, a, b], np.array([now]), chain)
+    assert 2 not in ground.node.peers(2.0)
+    first = ground.node.send_command("hold", 0, 2.0)
+    exchange([ground, a, b], ticks(2.0, 3.0), chain)
     assert [(c.action, c.nonce) for c in a.node.commands()] == [("hold", first)]
     assert [(c.action, c.nonce) for c in b.node.commands()] == [("hold", first)]
-    second = ground.node.send_command("land", 2, 3.0)
-    exchange([ground, a, b], ticks(3.0, 3.0), chain)
+    second = ground.node.send_command("land", 2, 5.0)
+    exchange([ground, a, b], ticks(5.0, 3.0), chain)
     assert a.node.commands() == []
     assert [(c.action, c.nonce) for c in b.node.commands()] == [("land", second)]
     assert second > first
+
+
+def test_an_order_waits_until_a_drone_that_it_is_for_is_heard() -> None:
+    ground, drone = make_drone(0), make_drone(1)
+    nonce = ground.node.send_command("land", 1, 0.0)
+    assert not carrying(ground.poll(0.0), messages.Command)
+    drone.node.set_status(Status(1, 0.1, Pose(0.0, 0.0, 0.0)))
+    exchange([ground, drone], ticks(0.1, 0.5))
+    assert [(c.action, c.nonce) for c in drone.node.commands()] == [("land", nonce)]
+
+
+@pytest.mark.parametrize("target", [0, 1])
+def test_recorded_orders_do_nothing_to_a_drone_that_has_just_started(target: int) -> None:
+    ground, drone = make_drone(0), make_drone(1)
+    drone.node.set_status(Status(1, 0.0, Pose(0.0, 0.0, 0.0)))
+    exchange([ground, drone], ticks(0.0, 0.3))
+    ground.node.send_command("land", target, 0.3)
+    exchange([ground, drone], ticks(0.3, 1.0))
+    assert [c.action for c in drone.node.commands()] == ["land"]
+    recorded = carrying([datagram for _, datagram in ground.sent], messages.Command)
+    again = make_drone(1, boot=2)
+    for datagram in recorded:
+        again.node.receive(datagram, 5.0)
+    assert again.node.commands() == []
+    assert again.node.stats == {"old-life": len(recorded)}
+    again.node.set_status(Status(1, 5.0, Pose(0.0, 0.0, 0.0)))
+    exchange([ground, again], ticks(5.0, 0.3))
+    ground.node.send_command("hold", target, 5.3)
+    exchange([ground, again], ticks(5.3, 1.0))
+    assert [c.action for c in again.node.commands()] == ["hold"]
+
+
+def test_an_order_that_names_nobody_is_refused_and_one_that_names_others_passed_over() -> None:
+    drone = make_drone(2)
+    for number, order in enumerate((
+        messages.Command("land", 0, 7), messages.Command("land", 2, 8, {1: 1}), messages.Command("land", 0, 9, {1: 1}),
+    )):  # fmt: skip
+        sealed = Sealer(KEY, 0, 1 + number).seal(messages.encode(order), 0.0)
+        drone.node.receive(sealed, 0.0)
+    assert drone.node.commands() == []
+    assert drone.node.stats == {"content": 2}
+
+
+def test_an_order_to_more_drones_than_one_message_names_reaches_all() -> None:
+    orders = Orders(0, 1, 2.0)
+    nonce = orders.issue("land", 0, 0.0)
+    (repeat,) = orders.due(0.0)
+    starts = {id_: 2**32 - id_ for id_ in range(1, 255)}
+    sent = repeat.commands(starts)
+    assert {id_: boot for order in sent for id_, boot in order.starts.items()} == starts
+    assert {(order.action, order.target, order.nonce) for order in sent} == {("land", 0, nonce)}
+    sealed = 30 + 64  # header, tag and signature
+    assert all(len(messages.encode(order)) + sealed <= MAX_DATAGRAM for order in sent)
 
 
 def test_only_the_ground_gives_orders() -> None:
@@ -378,8 +438,11 @@ def test_only_the_ground_gives_orders() -> None:
 
 def test_a_newer_order_silences_the_older_one() -> None:
     ground, a = make_drone(0), make_drone(1)
+    a.node.set_status(Status(1, 0.0, Pose(0.0, 0.0, 0.0)))
+    for datagram in a.poll(0.0):
+        ground.node.receive(datagram, 0.0)
     ground.node.send_command("hold", 1, 0.0)
-    ground.poll(0.0)
+    assert carrying(ground.poll(0.0), messages.Command)
     ground.node.send_command("land", 0, 0.1)
     exchange([ground, a], ticks(0.1, 3.0))
     assert [c.action for c in a.node.commands()] == ["land"]
@@ -507,12 +570,12 @@ def test_nothing_is_noted_of_tiles_that_are_refused(tiles: Tiles) -> None:
     cells = pack_tile(np.ones((32, 32), np.int8))
     for source in (3, 4) if tiles.source == 1 else (3, 4, 5):
         drone.node.receive(_FORGER.seal(messages.encode(Tiles(source, [Tile(0, 0, 1, cells)])), 0.0), 0.0)
-    record, noted = drone.node._peers.live(0.0)[0], len(drone.node._exchange._sent)
-    before = dict(record.holdings)
+    record, noted = drone.node._state.peers.live(0.0)[0], len(drone.node._state.exchange._sent)
+    before = copy.deepcopy(record.holdings)
     drone.node.receive(_FORGER.seal(messages.encode(tiles), 0.1), 0.1)
     assert drone.node.stats["content"] == 1
     assert record.holdings == before
-    assert len(drone.node._exchange._sent) == noted
+    assert len(drone.node._state.exchange._sent) == noted
 
 
 def test_what_newer_nodes_say_is_counted_and_hurts_nothing() -> None:

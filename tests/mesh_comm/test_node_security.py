@@ -11,7 +11,7 @@ from radio_room import CAP_M, KEY, LIDAR, Drone, exchange, make_drone, same_laye
 from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import Pose
 from imagine.mesh_comm.keyring import KeyRing, SwarmKey, ground_public
-from imagine.mesh_comm.messages import MAX_DATAGRAM
+from imagine.mesh_comm.messages import MAX_DATAGRAM, Status
 from imagine.mesh_comm.node import MeshNode, MeshSettings
 from imagine.mesh_comm.seal import Sealer
 
@@ -91,6 +91,10 @@ def test_clocks_that_differ_by_hours_change_nothing(offsets_h: tuple[float, ...]
 def test_only_the_signing_ground_is_obeyed_and_its_orders_are_passed_on_as_signed() -> None:
     ground, near, far = keyed(0, SIGNING), keyed(1, SIGNING.for_drones()), keyed(2, SIGNING.for_drones())
     captured = keyed(0, dataclasses.replace(SIGNING, ground_sign=None, ground_verify=None), boot=9)
+    near.node.set_status(Status(1, 0.0, Pose(0.0, 0.0, 0.0)))
+    for now in (0.0, 0.1):
+        far.fly(Pose(0.5, now, 0.0), now)  # so that `near` holds of its map, and tells the ground
+        exchange([near, far], np.array([now]))
     captured.node.send_command("land", 0, 0.0)
     exchange([captured, near], np.arange(0.0, 1.0, 0.1))
     assert near.node.commands() == []

@@ -238,10 +238,19 @@ def mesh_pair(settings: DroneSettings):
     return make_runner(settings, FixedPolicy(), node, evidence), ground
 
 
+def introduce(flight, ground):
+    """Let the ground hear the drone: it has to know a drone's start to order it anything."""
+    for _ in range(10):
+        for datagram in flight.tick().datagrams:
+            ground.receive(datagram, flight.vehicle.now)
+    assert ground.peers(flight.vehicle.now)[SETTINGS.drone_id].is_live
+
+
 def test_the_pilot_holds_resumes_and_lands_it_by_mesh():
     flight = FlatFlight(SETTINGS, FixedPolicy((0.2, 0.0)))
     flight.runner, ground = mesh_pair(SETTINGS)
     exploring(flight)
+    introduce(flight, ground)
     for action, decider in (("hold", "hold"), ("resume", "policy"), ("land", "land")):
         ground.send_command(action, 0, flight.vehicle.now)
         output = flight.tick(datagrams=tuple(ground.poll(flight.vehicle.now)))
@@ -254,6 +263,7 @@ def test_no_later_order_takes_a_landing_back(later):
     flight = FlatFlight(SETTINGS, FixedPolicy((0.2, 0.0)))
     flight.runner, ground = mesh_pair(SETTINGS)
     exploring(flight)
+    introduce(flight, ground)
     datagrams = []
     for action in ("land", later):  # both arrive before the next tick
         ground.send_command(action, 0, flight.vehicle.now)
