@@ -146,6 +146,8 @@ class Command(Struct, tag=5, array_like=True, frozen=True):
 
 
 ACTIONS = ("hold", "land", "resume")
+SAFE_ACTIONS = ("hold", "land")
+"""Orders that a drone obeys even where the ground does not know it."""
 
 Message = Scan | Tiles | Digest | Status | Command
 _FIELDS = {kind.__struct_config__.tag: 1 + len(kind.__struct_fields__) for kind in get_args(Message)}

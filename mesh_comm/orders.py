@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from imagine.core.errors import InputError
-from imagine.mesh_comm.messages import ACTIONS, GROUND, MOST_NAMED, Command
+from imagine.mesh_comm.messages import ACTIONS, GROUND, MOST_NAMED, SAFE_ACTIONS, Command
 
 _PERIOD_S = 0.25
 _EPSILON_S = 1e-6
@@ -26,9 +26,12 @@ class Repeat:
     def commands(self, starts: Mapping[int, int]) -> list[Command]:
         """Return the order as it is sent, when the drones that are known are in `starts`: boot numbers by id.
 
-        It names its targets among them, in as many messages as that takes; none where no target is known yet.
+        It names its targets among them, in as many messages as that takes. Where no target is known yet it names none,
+        and goes out only if it is safe to obey all the same.
         """
         named = sorted((id_, boot) for id_, boot in starts.items() if self.target in (GROUND, id_))
+        if not named and self.action in SAFE_ACTIONS:
+            return [Command(self.action, self.target, self.nonce, {})]
         return [
             Command(self.action, self.target, self.nonce, dict(named[first : first + MOST_NAMED]))
             for first in range(0, len(named), MOST_NAMED)
@@ -76,7 +79,8 @@ class Orders:
 
         It is passed on as it came under every protocol: a pilot's order must reach drones out of the ground's reach.
         The seal proves that it is the ground's, and the replay window ends the flood. But a drone that has just started
-        has no window yet, and what it hears may be a recording: it obeys only what names its own start.
+        has no window yet, and what it hears may be a recording: what names another start of it is not obeyed, and what
+        names none only if it tells it to hold or land, for a pilot must be able to stop a drone that nobody hears.
         """
         if sender != GROUND or self._own == GROUND:
             raise InputError("a command that is not from the ground")
@@ -84,12 +88,16 @@ class Orders:
         if command.target not in (GROUND, self._own):
             return False
         boot = command.starts.get(self._own)
-        if boot is None and (command.target == self._own or not command.starts):
-            raise InputError("a command that does not name the start of the drone that it is for")
-        if boot == self._boot and command.nonce > self.last_nonce:
+        if boot is None and command.action not in SAFE_ACTIONS:
+            if command.target == self._own or not command.starts:
+                raise InputError("a command to fly on that does not name the start of the drone that it is for")
+            return False
+        if boot is not None and boot != self._boot:
+            return True
+        if command.nonce > self.last_nonce:
             self.last_nonce = command.nonce
             self._taken.append(command)
-        return boot is not None and boot != self._boot
+        return False
 
     def drain(self) -> list[Command]:
         """Return the orders taken since the last call, oldest first."""

@@ -371,13 +371,25 @@ def test_orders_reach_everyone_once_even_beyond_the_grounds_reach() -> None:
     assert second > first
 
 
-def test_an_order_waits_until_a_drone_that_it_is_for_is_heard() -> None:
+def test_an_order_to_fly_on_waits_until_a_drone_that_it_is_for_is_heard() -> None:
     ground, drone = make_drone(0), make_drone(1)
-    nonce = ground.node.send_command("land", 1, 0.0)
+    nonce = ground.node.send_command("resume", 1, 0.0)
     assert not carrying(ground.poll(0.0), messages.Command)
     drone.node.set_status(Status(1, 0.1, Pose(0.0, 0.0, 0.0)))
     exchange([ground, drone], ticks(0.1, 0.5))
-    assert [(c.action, c.nonce) for c in drone.node.commands()] == [("land", nonce)]
+    assert [(c.action, c.nonce) for c in drone.node.commands()] == [("resume", nonce)]
+
+
+@pytest.mark.parametrize("target", [0, 2])
+@pytest.mark.parametrize("action", ["hold", "land"])
+def test_a_drone_that_the_ground_never_heard_can_be_stopped(target: int, action: str) -> None:
+    ground, known, silent = make_drone(0), make_drone(1), make_drone(2)
+    known.node.set_status(Status(1, 0.0, Pose(0.0, 0.0, 0.0)))
+    exchange([ground, known], ticks(0.0, 0.3))
+    nonce = ground.node.send_command(action, target, 0.3)
+    for datagram in carrying(ground.poll(0.3), messages.Command):
+        silent.node.receive(datagram, 0.3)
+    assert [(c.action, c.nonce) for c in silent.node.commands()] == [(action, nonce)]
 
 
 @pytest.mark.parametrize("target", [0, 1])
@@ -401,10 +413,11 @@ def test_recorded_orders_do_nothing_to_a_drone_that_has_just_started(target: int
     assert [c.action for c in again.node.commands()] == ["hold"]
 
 
-def test_an_order_that_names_nobody_is_refused_and_one_that_names_others_passed_over() -> None:
+def test_an_order_to_fly_on_is_refused_without_the_drones_name_and_passed_over_where_it_names_others() -> None:
     drone = make_drone(2)
     for number, order in enumerate((
-        messages.Command("land", 0, 7), messages.Command("land", 2, 8, {1: 1}), messages.Command("land", 0, 9, {1: 1}),
+        messages.Command("resume", 0, 7), messages.Command("resume", 2, 8, {1: 1}),
+        messages.Command("resume", 0, 9, {1: 1}),
     )):  # fmt: skip
         sealed = Sealer(KEY, 0, 1 + number).seal(messages.encode(order), 0.0)
         drone.node.receive(sealed, 0.0)
