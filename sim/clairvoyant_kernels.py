@@ -13,7 +13,8 @@ from imagine.sim.rays import cast_rays
 
 TICKS_PER_S = round(1.0 / TICK_S)
 _NOWHERE = 1e9
-_STEP_M = 0.05  # along a beam, half a cell
+_STEP_M = 0.05  # along a beam or a flight, half a cell
+_AHEAD_M, _NEXT_M = 1.2, 0.35
 
 
 @numba.njit(cache=True, nogil=True)
@@ -57,13 +58,18 @@ def _ones(word):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def covered_after(way, lengths, starts, nodes, far, before, seen, needed, speed, most_ticks, passed):  # type: ignore[no-untyped-def]
+def covered_after(  # type: ignore[no-untyped-def]
+    way, lengths, starts, nodes, far, before, seen, known, needed, speed, most_ticks, per_metre, passed, scratch
+):
     """Return the ticks until `needed` cells are seen by drones that fly through their waypoints by the shortest ways.
 
     `way` `[drones, most]` are waypoints, the first `lengths` `[drones]` count; `nodes` where they are, `far` and
-    `before` `[waypoints, points]` the ways to each. Beyond `most_ticks` by as much as is missing. `passed` is scratch.
+    `before` `[waypoints, points]` the ways to each; `known` uint64 `[words]` what is seen already. Beyond `most_ticks`
+    by as much as is missing; every metre of the plan costs `per_metre` ticks more. `passed` `[drones, most_ticks + 1]`
+    and `scratch` `[words]` are worked with.
     """
     passed[:] = -1
+    last, total = 0, 0.0
     for drone in range(len(starts)):
         at, metres = starts[drone], 0.0
         for k in range(lengths[drone]):
@@ -77,42 +83,57 @@ def covered_after(way, lengths, starts, nodes, far, before, seen, needed, speed,
                 tick = math.ceil(metres / speed * TICKS_PER_S)
                 if tick <= most_ticks:
                     passed[drone, tick] = at
-    known = np.zeros(seen.shape[1], np.uint64)
+                    last = max(last, tick)
+        total += metres
+    scratch[:] = known
     for drone in range(len(starts)):
-        known |= seen[starts[drone]]
-    count = bits(known)
-    for tick in range(most_ticks + 1):
+        scratch |= seen[starts[drone]]
+    count = bits(scratch)
+    for tick in range(last + 1):
         for drone in range(len(starts)):
             at = passed[drone, tick]
             if at >= 0:
-                for word in range(len(known)):
-                    new = seen[at, word] & ~known[word]
+                for word in range(len(scratch)):
+                    new = seen[at, word] & ~scratch[word]
                     if new:
-                        known[word] |= new
+                        scratch[word] |= new
                         count += _ones(new)
         if count >= needed:
-            return float(tick)
-    return most_ticks * (1.0 + (needed - count) / needed)
+            return tick + per_metre * total
+    return most_ticks * (1.0 + (needed - count) / needed) + per_metre * total
 
 
 @numba.njit(cache=True, nogil=True)
-def quickest(starts, nodes, far, before, seen, needed, speed, most_ticks, tries, most_waypoints, generator):  # type: ignore[no-untyped-def]
-    """Return the fewest ticks that simulated annealing finds, over drones' waypoints: which, whose, in what order."""
-    drones, choices = len(starts), len(nodes)
-    way, lengths = np.zeros((drones, most_waypoints), np.int64), np.zeros(drones, np.int64)
-    passed = np.empty((drones, most_ticks + 1), np.int64)
-    now = best = covered_after(way, lengths, starts, nodes, far, before, seen, needed, speed, most_ticks, passed)
+def improve(  # type: ignore[no-untyped-def]
+    way, lengths, starts, nodes, far, before, seen, known, needed, speed, most_ticks, tries, heat, per_metre, generator
+):
+    """Improve a plan (`way`, `lengths`, as in `covered_after`) by simulated annealing; return the ticks that it takes.
+
+    What is changed are drones' waypoints: which, whose, in what order. `heat` in ticks is what annealing begins with;
+    the best plan of all is what remains.
+    """
+    passed, scratch = np.empty((len(starts), most_ticks + 1), np.int64), np.empty_like(known)
+    now = best = covered_after(
+        way, lengths, starts, nodes, far, before, seen, known, needed, speed, most_ticks, per_metre, passed, scratch
+    )
+    best_way, best_lengths = way.copy(), lengths.copy()
+    kept_way, kept_lengths = way.copy(), lengths.copy()
     for k in range(tries):
-        heat = 12.0 * (1.0 - k / tries) + 0.05
-        kept_way, kept_lengths = way.copy(), lengths.copy()
-        if not _change(way, lengths, nodes, far, choices, generator):
+        warmth = heat * (1.0 - k / tries) + 0.05
+        kept_way[:], kept_lengths[:] = way, lengths
+        if not _change(way, lengths, nodes, far, len(nodes), generator):
             continue
-        new = covered_after(way, lengths, starts, nodes, far, before, seen, needed, speed, most_ticks, passed)
-        if new <= now or generator.random() < math.exp((now - new) / heat):
+        new = covered_after(
+            way, lengths, starts, nodes, far, before, seen, known, needed, speed, most_ticks, per_metre, passed, scratch
+        )
+        if new <= now or generator.random() < math.exp((now - new) / warmth):
             now = new
-            best = min(best, now)
+            if now < best:
+                best = now
+                best_way[:], best_lengths[:] = way, lengths
         else:
-            way, lengths = kept_way, kept_lengths
+            way[:], lengths[:] = kept_way, kept_lengths
+    way[:], lengths[:] = best_way, best_lengths
     return best
 
 
@@ -163,3 +184,51 @@ def _take(way, lengths, drone, place):  # type: ignore[no-untyped-def]
     for k in range(place, lengths[drone] - 1):
         way[drone, k] = way[drone, k + 1]
     lengths[drone] -= 1
+
+
+@numba.njit(cache=True, nogil=True)
+def path_through(way, length, start, nodes, before):  # type: ignore[no-untyped-def]
+    """Return the points of the shortest way from point `start` through a drone's waypoints, int64 `[n]`."""
+    at, path = start, [start]
+    for k in range(length):
+        while at != nodes[way[k]]:
+            at = before[way[k], at]
+            if at < 0:
+                return np.array(path)
+            path.append(at)
+    return np.array(path)
+
+
+@numba.njit(cache=True, nogil=True)
+def ahead(path, points, x, y, clear, column0, row0):  # type: ignore[no-untyped-def]
+    """Return the farthest point of a path that (x, y) can fly to straight, at most `_AHEAD_M` along the path.
+
+    Straight is through `clear` cells, bool `[rows, columns]` from cell (column0, row0). Where nothing is, in a door, it is
+    the last point of the path that is only a step away.
+    """
+    best, metres = -1, 0.0
+    for k in range(1, len(path)):
+        at, last = path[k], path[k - 1]
+        metres += math.hypot(points[at, 0] - points[last, 0], points[at, 1] - points[last, 1])
+        away = math.hypot(points[at, 0] - x, points[at, 1] - y)
+        if _is_clear(x, y, points[at, 0], points[at, 1], clear, column0, row0) or (best < 0 and away < _NEXT_M):
+            best = at
+        elif best >= 0:
+            return best
+        if metres >= _AHEAD_M:
+            return at if best < 0 else best
+    return path[-1] if best < 0 else best
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_clear(x, y, to_x, to_y, clear, column0, row0):  # type: ignore[no-untyped-def]
+    metres = math.hypot(to_x - x, to_y - y)
+    steps = int(metres / _STEP_M) + 1
+    for step in range(1, steps + 1):
+        if step * metres < 0.15 * steps and metres > 0.3:
+            continue  # where it is, it may be too near a wall
+        column = math.floor((x + (to_x - x) * step / steps) / CELL) - column0
+        row = math.floor((y + (to_y - y) * step / steps) / CELL) - row0
+        if not (0 <= row < clear.shape[0] and 0 <= column < clear.shape[1] and clear[row, column]):
+            return False
+    return True

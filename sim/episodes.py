@@ -97,6 +97,11 @@ class Episodes:
         shares = np.arange(1, len(self.limit) + 1) / len(self.limit)
         self.limit[...] = np.maximum(_SHORTEST_TICKS, np.round(self._settings.episode_ticks * shares))
 
+    def as_designed(self) -> NDArray[np.bool_]:
+        """Return which worlds began at the launch point of their level as it is, bool `[worlds]`."""
+        starts = [self._starts.get(world) for world in range(len(self.limit))]
+        return np.array([start is not None and not start.anywhere and start.variant == 0 for start in starts])
+
     def state_dict(self) -> dict[str, Any]:
         """Return how the episodes in progress began and came on; plain containers and arrays of the caller's own."""
         starts = [self._starts[world] for world in sorted(self._starts)]

@@ -143,6 +143,11 @@ class Exploration:
         return self.twin.alive
 
     @property
+    def as_designed(self) -> NDArray[np.bool_]:
+        """Which worlds began at the launch point of their level as it is, bool `[worlds]`."""
+        return self._episodes.as_designed()
+
+    @property
     def level_weights(self) -> NDArray[np.float64]:
         """The share of coming episodes of each level that `settings.levels` stand for, `[levels]`."""
         return self._episodes.weights.copy()

@@ -26,12 +26,19 @@ _SAME_WAY = 0.03  # of 1 - cosine: directions up to about 10 degrees apart count
 _ALONG = 0.7  # cosine from which on a label points at a frontier
 
 
+Teacher = Literal["frontier", "coordinated", "hungarian", "clairvoyant"]
+
+
 class ImitationSettings(Settings):
     """How long and how the planner is imitated."""
 
-    teacher: Literal["frontier", "coordinated", "hungarian"] = Field(
+    teacher: Teacher = Field(
         default="coordinated", description="the planner whose advice labels the states that are visited"
     )
+    launch_point_teacher: Teacher | None = Field(
+        default=None, description="who labels what began at the launch point of a level as it is; none: the teacher"
+    )
+    student_draws: bool = Field(default=True, description="the student flies what it draws, not what it holds for best")
     agent_steps: int = Field(default=250_000, ge=0, description="labelled decisions; 0 leaves imitation out")
     round_steps: int = Field(default=32, ge=1, description="steps of every world between two rounds of learning")
     gradient_steps: int = Field(default=24, ge=1, description="steps of Adam a round")
@@ -65,6 +72,7 @@ def collect_labels(
     generator: torch.Generator,
     precision: Precision = "float32",
     recall: Recall | None = None,
+    student_draws: bool = True,
 ) -> tuple[Observation, list[EpisodeMetrics], int]:
     """Fly `steps` in all worlds and label every state; return the next observation, finished episodes and labels added.
 
@@ -90,8 +98,10 @@ def collect_labels(
             elif isinstance(buffer, LabelBuffer):
                 buffer.add({key: value[labelled] for key, value in seen.items()}, labels[labelled])
             decisions = next_decisions(actor, {**seen, "alive": alive.to(actor.device)}, recall, env.drones)
-            drawn, _ = actor.draw(decisions, noise[t], seen, estimates(env))
-            actions = actor.flown(seen, drawn).cpu()
+            actions = decisions.mean.cpu()
+            if student_draws:
+                drawn, _ = actor.draw(decisions, noise[t], seen, estimates(env))
+                actions = actor.flown(seen, drawn).cpu()
             by_planner = planner_flies & labelled
             actions[by_planner] = labels[by_planner]
             step = env.step(env_actions(actions, env))

@@ -26,8 +26,11 @@ class Pilot(Protocol):
     def forget(self, worlds: NDArray[np.bool_]) -> None:
         """Drop what is kept of these worlds (bool `[worlds]`), which have started new episodes."""
 
-    def act(self, env: Exploration, observation: Observation) -> Actions:
-        """Return the actions, float32 `[worlds, drones, action size]` in [-1, 1]; nan where a planner has no advice."""
+    def act(self, env: Exploration, observation: Observation, worlds: NDArray[np.bool_] | None = None) -> Actions:
+        """Return the actions, float32 `[worlds, drones, action size]` in [-1, 1]; nan where a planner has no advice.
+
+        Of other worlds than `worlds` (bool `[worlds]`, None: all) they are not used: whoever plans for long leaves them.
+        """
 
 
 class RandomPilot:
@@ -49,7 +52,7 @@ class RandomPilot:
     def forget(self, worlds: NDArray[np.bool_]) -> None:
         """Keep nothing: the draws go on."""
 
-    def act(self, env: Exploration, observation: Observation) -> Actions:
+    def act(self, env: Exploration, observation: Observation, worlds: NDArray[np.bool_] | None = None) -> Actions:
         """Return a draw."""
         shape = (env.drones, env.settings.action.size)
         return np.stack([rng.uniform(-1.0, 1.0, shape).astype(np.float32) for rng in self._generators])

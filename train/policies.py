@@ -64,7 +64,7 @@ class PolicyPilot:
         """Drop what is remembered of these worlds."""
         self._state[worlds] = 0.0
 
-    def act(self, env: Exploration, observation: Observation) -> Actions:
+    def act(self, env: Exploration, observation: Observation, worlds: NDArray[np.bool_] | None = None) -> Actions:
         """Return the policy's actions, the same for a world whichever others fly beside it."""
         rows, drones = env.worlds * env.drones, env.drones
         room = drones * max(env.worlds, math.ceil(_LEAST_ROWS / drones))

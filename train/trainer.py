@@ -20,12 +20,14 @@ from imagine.sim.exploration import Exploration
 from imagine.sim.generator import PREFIX
 from imagine.train.atomic_file import write_atomically
 from imagine.train.baselines import baseline
+from imagine.train.baselines.launch_points import LaunchPointPilot
 from imagine.train.checkpoint import Checkpoint, Phase, check_same_network, load_checkpoint
 from imagine.train.curriculum import Curriculum
 from imagine.train.evaluation import evaluate
 from imagine.train.imitation import collect_labels, label_buffer, learn
 from imagine.train.learner import Learner
 from imagine.train.policies import policy_of
+from imagine.train.pilots import Pilot
 from imagine.train.ppo import update
 from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
 from imagine.train.rollout import Recall
@@ -176,7 +178,7 @@ class Trainer:
         """Let the student fly and learn from the planner's labels, round after round."""
         settings, learner = self.settings.imitation, self.learner
         buffer = label_buffer(learner.actor, settings.buffer_samples)
-        teacher = baseline(settings.teacher, self.settings.run.seed)
+        teacher = self._teacher()
         teacher.begin(self.env)
         while self.agent_steps["imitation"] < settings.agent_steps and not self._stop.is_set():
             done_share = self.agent_steps["imitation"] / settings.agent_steps
@@ -185,7 +187,7 @@ class Trainer:
             planner_share = settings.planner_share * max(0.0, 1.0 - done_share / until)
             self._observation, episodes, labels = collect_labels(
                 self.env, self._observation, learner.actor, teacher, buffer, settings.round_steps, planner_share,
-                learner.rng, learner.generator, settings.precision, self._recall,
+                learner.rng, learner.generator, settings.precision, self._recall, settings.student_draws,
             )  # fmt: skip
             collected = time.monotonic()
             for group in learner.imitation.param_groups:
@@ -200,6 +202,13 @@ class Trainer:
             if not self.settings.run.rollout_workers:
                 self._source = self._own_rollouts()
             self._folder.save(self.checkpoint(), "imitated")
+
+    def _teacher(self) -> Pilot:
+        settings, seed = self.settings.imitation, self.settings.run.seed
+        teacher = baseline(settings.teacher, seed)
+        if settings.launch_point_teacher is None:
+            return teacher
+        return LaunchPointPilot(teacher, baseline(settings.launch_point_teacher, seed))
 
     def _own_rollouts(self) -> OwnRollouts:
         return OwnRollouts(self.env, self._observation, self._recall, self.settings.ppo)

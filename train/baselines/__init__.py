@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from imagine.core.errors import InputError
+from imagine.train.baselines.clairvoyant import ClairvoyantPilot
 from imagine.train.baselines.parameters import COORDINATED, HUNGARIAN, NEAREST
 from imagine.train.baselines.pilot import FrontierPilot
 from imagine.train.pilots import Pilot, RandomPilot
@@ -17,6 +18,7 @@ BASELINES: dict[str, Callable[[int], Pilot]] = {
     "frontier": lambda seed: FrontierPilot("frontier", NEAREST),
     "coordinated": lambda seed: FrontierPilot("coordinated", COORDINATED),
     "hungarian": lambda seed: FrontierPilot("hungarian", HUNGARIAN, "hungarian"),
+    "clairvoyant": ClairvoyantPilot,
 }
 """What makes each baseline, given a seed; only chance uses it."""
 

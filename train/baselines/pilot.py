@@ -43,7 +43,7 @@ class FrontierPilot:
         """Drop the choices made in these worlds."""
         forget(self._state, worlds)
 
-    def act(self, env: Exploration, observation: Observation) -> Actions:
+    def act(self, env: Exploration, observation: Observation, worlds: NDArray[np.bool_] | None = None) -> Actions:
         """Return full speed toward each drone's frontier, nan where it is dead or knows of none that it can get to."""
         state, maps, air = self._state, env.maps.arrays, env.air
         over = env.twin.workers.over
