@@ -12,7 +12,7 @@ from imagine.core.raster import CELL
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.codec import unpack_tile
 from imagine.mesh_comm.known_cells import KnownCells
-from imagine.mesh_comm.messages import Tiles, tile_key
+from imagine.mesh_comm.messages import Sketch, Tiles, tile_key
 from imagine.mesh_comm.provenance import CellProvenance, Provenance
 from imagine.mesh_comm.scan_exchange import draw_peer_scan
 from imagine.mesh_comm.settings import MeshSettings
@@ -85,6 +85,19 @@ class MapInbox:
             if self._exchange.merge(message.source, tile, cells):
                 self._provenance.note_tile(message.source, key, tile.version, via, now)
                 self.map_cells += self._known.claim_tile(message.source, key)
+
+    def take_sketch(self, message: Sketch, via: int, now: float) -> None:
+        """Fill in what node `via` heard of a source that is out of reach here. Raises InputError with none taken."""
+        unpacked = [unpack_tile(tile.packed) for tile in message.tiles]
+        if not self.renew(message.source, message.boot):
+            return
+        for tile, cells in zip(message.tiles, unpacked, strict=True):
+            key = tile_key(tile)
+            if self._own_counted != self._own_clock:
+                self.own_cells += self._known.claim_tile(message.source, key)
+            if self._evidence.sketch_tile(message.source, key, tile.version, cells):
+                self._provenance.note_sketch(message.source, key, via, now)
+                self.scan_cells += self._known.claim_tile(message.source, key)
 
     def note_placed(self) -> None:
         """Count what became known because a peer's map found its place, as cells that its tiles made known."""

@@ -55,6 +55,7 @@ class _Arrival:
     tile_at: float | None = None
     stamp: float | None = None
     scan_at: float | None = None
+    sketch_via: int | None = None
 
 
 class Provenance:
@@ -89,12 +90,17 @@ class Provenance:
         provisional = self._evidence.layers[source].provisional[row : last_row + 1, column : last_column + 1]
         for i, j in np.argwhere(provisional).tolist():
             arrival = self._arrival(source, TileKey(column + j + corner.column, row + i + corner.row))
-            arrival.stamp, arrival.scan_at = stamp, now
+            arrival.stamp, arrival.scan_at, arrival.sketch_via = stamp, now, None
 
     def note_tile(self, source: int, key: TileKey, version: int, via: int, now: float) -> None:
         """Note a tile that was taken into the map, heard from node `via`."""
         arrival = self._arrival(source, key)
         arrival.version, arrival.via, arrival.tile_at = version, via, now
+
+    def note_sketch(self, source: int, key: TileKey, via: int, now: float) -> None:
+        """Note that node `via` filled in cells of a tile from scans of the source that it heard."""
+        arrival = self._arrival(source, key)
+        arrival.sketch_via, arrival.scan_at = via, now
 
     def forget(self, source: int) -> None:
         """Drop what is noted of a source, whose layer was dropped."""
@@ -130,6 +136,9 @@ class Provenance:
         if source == evidence.own:
             return Sighting(source, units, "own scan", source, arrival.version, arrival.stamp, arrival.scan_at, False)
         if arrival.version == 0 or (provisional and (arrival.scan_at or 0.0) >= (arrival.tile_at or 0.0)):
+            if provisional and arrival.sketch_via is not None:
+                via = arrival.sketch_via
+                return Sighting(source, units, "relay", via, arrival.version, arrival.stamp, arrival.scan_at, True)
             return Sighting(source, units, "scan", source, arrival.version, arrival.stamp, arrival.scan_at, provisional)
         way: Way = "tile" if arrival.via == source else "relay"
         return Sighting(source, units, way, arrival.via, arrival.version, arrival.stamp, arrival.tile_at, provisional)

@@ -13,8 +13,8 @@ from imagine.core.lidar import LidarSpec, Scan, mask_near
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.budget import TokenBucket
 from imagine.mesh_comm.digest import Held, digests
-from imagine.mesh_comm.information import FEW_NEWS_S, NO_NEWS_S, SCAN_NEWS_CELLS
-from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Digest, Message, Status
+from imagine.mesh_comm.information import NO_NEWS_S
+from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Digest, Here, Message, Status
 from imagine.mesh_comm.node_state import NodeState
 from imagine.mesh_comm.receipts import Bought
 from imagine.mesh_comm.scan_exchange import scan_message
@@ -54,6 +54,8 @@ class Speaking:
         self._scan_since = self._scan_sent_at = -np.inf
         self._scans_ahead = 1
         self._cells_told = 0
+        self._pose_told_at = -np.inf
+        self._order_told = 0
 
     def offer_scan(self, scan: Scan, pose: Pose, now: float) -> None:
         """Offer the own scan, taken at `pose` and integrated before; see `MeshNode.offer_scan`."""
@@ -75,9 +77,9 @@ class Speaking:
     def _is_worth_telling(self, now: float) -> bool:
         """Tell whether what own scans have made known since the last one that was sent is worth another."""
         news = self._maps.own_cells - self._cells_told
-        if self._settings.scheduler == "fifo" or news >= SCAN_NEWS_CELLS:
+        if self._settings.scheduler == "fifo" or news > 0:
             return True
-        return now >= self._scan_sent_at + (FEW_NEWS_S if news > 0 else NO_NEWS_S) - _EPSILON_S
+        return now >= self._scan_sent_at + NO_NEWS_S - _EPSILON_S
 
     def set_status(self, status: Status) -> None:
         """Set what the next status message tells; cells, bytes, links, rejections and command are filled in."""
@@ -95,7 +97,8 @@ class Speaking:
             self._maps.note_placed()
         self._prepare(now)
         for step in (
-            self._send_claim, self._send_commands, self._send_status, self._send_digests, self._send_maps,
+            self._send_claim, self._send_commands, self._send_status, self._send_here, self._send_digests,
+            self._send_maps,
         ):  # fmt: skip
             if not step(out, now):
                 break  # out of bytes: what is left keeps its place
@@ -144,8 +147,9 @@ class Speaking:
         return True
 
     def _send_status(self, out: list[bytes], now: float) -> bool:
-        if self._status is None or now < self._next_status - _EPSILON_S:
-            return True
+        order = self._state.orders.last_nonce
+        if self._status is None or (now < self._next_status - _EPSILON_S and order == self._order_told):
+            return True  # that an order came is told at once
         full = msgspec.structs.replace(
             self._status,
             own_cells=self._maps.own_cells,
@@ -154,13 +158,33 @@ class Speaking:
             bytes_sent=dict(self.bytes_sent),
             links=self._peers.ages(now, most=32),
             rejected=sum(self._state.stats.values()),
-            last_command=self._state.orders.last_nonce,
+            last_command=order,
             taught={kind: self._exchange.receipts.by_kind[kind].cells for kind in _TOLD},
         )
         if not self._send(full, "status", out, now):
             return False
-        self._next_status = now + self._settings.status_period_s
+        self._next_status, self._pose_told_at = now + self._settings.status_period_s, now
+        self._order_told = order
         return True
+
+    def _send_here(self, out: list[bytes], now: float) -> bool:
+        """Tell the pose where no status or scan has told it lately, more often to peers that are near."""
+        if self._status is None:
+            return True
+        settings, pose = self._settings, self._status.pose
+        period_s = settings.pose_period_s
+        if self._scan is None and self._is_near(pose, now):  # a scan that waits will tell it
+            period_s = min(period_s, settings.near_pose_period_s)
+        if now < self._pose_told_at + period_s - _EPSILON_S:
+            return True
+        if not self._send(Here(self._id, self._status.stamp, pose, self._status.velocity), "status", out, now):
+            return False
+        self._pose_told_at = now
+        return True
+
+    def _is_near(self, pose: Pose, now: float) -> bool:
+        away = self._peers.positions(now) - np.array(pose[:2])
+        return bool((np.hypot(away[:, 0], away[:, 1]) <= self._settings.near_m).any())
 
     def _send_digests(self, out: list[bytes], now: float) -> bool:
         while self._digests:
@@ -202,6 +226,7 @@ class Speaking:
         self._scan_clock = self._scan.clock
         self._scan = None
         self._scan_sent_at, self._next_scan = now, now + self._settings.scan_period_s
+        self._pose_told_at = now
         return True
 
     def _send_tiles(self, out: list[bytes], now: float) -> bool:
