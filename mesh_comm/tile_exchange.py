@@ -215,8 +215,9 @@ class TileExchange:
                 key = TileKey(column + evidence.corner.column, row + evidence.corner.row)
                 told, worth, known = {}, 0, self._known(source, key)
                 for peer in peers:
-                    later = peer.holds(source, layer.boot, key) > layer.versions[row, column]
-                    if later or self._sketched.get((peer.id, source, key), 0) >= known:
+                    # a copy that the peer still lacks would overwrite the sketch: that goes first
+                    holds_same = peer.holds(source, layer.boot, key) == layer.versions[row, column]
+                    if not holds_same or self._sketched.get((peer.id, source, key), 0) >= known:
                         continue
                     fresh, edge, _ = self._unseen(source, key, peer)
                     told[peer.id] = fresh

@@ -118,8 +118,8 @@ def _plan_sketches(node, readers, drone, layers, versions, holdings, notes, sket
             row, column = tile // tile_columns, tile % tile_columns
             known, worth = known_cells(layers[drone, source], row * TILE, column * TILE), np.int64(0)
             for peer in range(drones):
-                has_later = holdings[peer, source, tile] > versions[drone, source, row, column]
-                if (readers >> peer) & 1 == 0 or has_later or np.int64(sketched[peer, source, tile]) >= known:
+                has_same = holdings[peer, source, tile] == versions[drone, source, row, column]
+                if (readers >> peer) & 1 == 0 or not has_same or np.int64(sketched[peer, source, tile]) >= known:
                     continue
                 fresh, edge, _ = tile_news(layers[drone, source], row * TILE, column * TILE, layers[drone, peer])
                 worth += fresh + FRONTIER_WORTH * edge
