@@ -23,6 +23,8 @@ from imagine.mesh_comm.tile_exchange import Wanted
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4  # of a longer digest, this many go out per period, in turn
 _DIGEST_SHARE, _MOST_DIGEST_S = 0.125, 1.5  # where bytes are short, digests take so much of them, or come so late
+_STATUS_SHARE, _MOST_STATUS_S = 0.125, 2.0  # so do statuses
+_HERE_SHARE, _MOST_HERE_S = 0.2, 1.0  # and poses between them, well within a peer's timeout
 _SCANS_BEFORE_NEWS, _SCANS_BEFORE_REPEATS = 1, 4  # where bytes are short, so many scans go before a message of tiles
 _TOLD: tuple[Bought, ...] = ("scan", "tile")
 _EPSILON_S = 1e-6  # periods are whole ticks: rounding of their sum must not cost a tick
@@ -54,7 +56,7 @@ class Speaking:
         self._scan_since = self._scan_sent_at = -np.inf
         self._scans_ahead = 1
         self._cells_told = 0
-        self._pose_told_at = -np.inf
+        self._pose_told_at, self._here_bytes = -np.inf, 0
         self._order_told = 0
 
     def offer_scan(self, scan: Scan, pose: Pose, now: float) -> None:
@@ -163,7 +165,8 @@ class Speaking:
         )
         if not self._send(full, "status", out, now):
             return False
-        self._next_status, self._pose_told_at = now + self._settings.status_period_s, now
+        spread_s = self._spread_s(len(out[-1]), _STATUS_SHARE, _MOST_STATUS_S)
+        self._next_status, self._pose_told_at = now + max(self._settings.status_period_s, spread_s), now
         self._order_told = order
         return True
 
@@ -175,12 +178,19 @@ class Speaking:
         period_s = settings.pose_period_s
         if self._scan is None and self._is_near(pose, now):  # a scan that waits will tell it
             period_s = min(period_s, settings.near_pose_period_s)
+        period_s = max(period_s, self._spread_s(self._here_bytes, _HERE_SHARE, _MOST_HERE_S))
         if now < self._pose_told_at + period_s - _EPSILON_S:
             return True
         if not self._send(Here(self._id, self._status.stamp, pose, self._status.velocity), "status", out, now):
             return False
-        self._pose_told_at = now
+        self._pose_told_at, self._here_bytes = now, len(out[-1])
         return True
+
+    def _spread_s(self, size: int, share: float, most_s: float) -> float:
+        """Return how long to wait after `size` bytes so that their kind takes `share` of the rate, at most `most_s`."""
+        if self._settings.scheduler == "fifo":
+            return 0.0
+        return min(most_s, size / (share * self._settings.rate_bytes_per_s))
 
     def _is_near(self, pose: Pose, now: float) -> bool:
         away = self._peers.positions(now) - np.array(pose[:2])
@@ -192,9 +202,8 @@ class Speaking:
                 return False
             self._digests.popleft()
             self._digest_bytes += len(out[-1])
-            if self._settings.scheduler == "information":
-                spread_s = self._digest_bytes / (_DIGEST_SHARE * self._settings.rate_bytes_per_s)
-                self._next_digest = max(self._next_digest, self._digest_at + min(_MOST_DIGEST_S, spread_s))
+            spread_s = self._spread_s(self._digest_bytes, _DIGEST_SHARE, _MOST_DIGEST_S)
+            self._next_digest = max(self._next_digest, self._digest_at + spread_s)
         return True
 
     def _send_maps(self, out: list[bytes], now: float) -> bool:

@@ -44,6 +44,8 @@ from imagine.sim.air_tiles import claim, copy_tile, find_spans
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4
 _DIGEST_SHARE, _MOST_DIGEST_S = 0.125, 1.5
+_STATUS_SHARE, _MOST_STATUS_S = 0.125, 2.0
+_HERE_SHARE, _MOST_HERE_S = 0.2, 1.0
 _SCANS_BEFORE_NEWS, _SCANS_BEFORE_REPEATS = 1, 4
 _EPSILON_S = 1e-6
 _MAX_PAYLOAD = MAX_DATAGRAM - OVERHEAD
@@ -128,13 +130,15 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
             plan(air, world, tick, drone, live if rules.shares else 0, layers, versions)
         if now >= node.next_status - _EPSILON_S:
             said = _send_status(
-                rules, now, node, messages[drone], counters[drone], peers[drone], poses[drone], velocity[drone], live
+                rules, now, node, messages[drone], counters[drone], peers[drone], poses[drone], velocity[drone], live,
+                air.media[world, BUDGET],
             )  # fmt: skip
             if not said:
                 continue
         period = rules.pose_period
         if node.pending_clock == 0 and _is_near(peers[drone], poses[drone], tick, rules):
             period = min(period, rules.near_pose_period)  # a scan that waits will tell it
+        period = max(period, min(_MOST_HERE_S, here_bytes() / (_HERE_SHARE * air.media[world, BUDGET])))
         is_due = now >= node.pose_told_at + period - _EPSILON_S
         if is_due and not _send_here(
             rules, now, node, messages[drone], counters[drone], poses[drone], velocity[drone]
@@ -213,7 +217,7 @@ def _transmit(rules, now, node, messages, counters, kind, size):  # type: ignore
 
 
 @numba.njit(cache=True, nogil=True)
-def _send_status(rules, now, node, messages, counters, peers, pose, velocity, live):  # type: ignore[no-untyped-def]
+def _send_status(rules, now, node, messages, counters, peers, pose, velocity, live, budget):  # type: ignore[no-untyped-def]
     """Send where the drone is and whom it hears; False when bytes run short."""
     heard = 0
     for peer in range(peers.shape[0]):
@@ -226,7 +230,8 @@ def _send_status(rules, now, node, messages, counters, peers, pose, velocity, li
         message = messages[place]
         message.x, message.y, message.yaw = pose[0], pose[1], pose[2]
         message.vx, message.vy, message.hears, message.slot = velocity[0], velocity[1], live, 0
-    node.next_status, node.pose_told_at = now + rules.status_period, now
+    spread = min(_MOST_STATUS_S, size / (_STATUS_SHARE * budget))
+    node.next_status, node.pose_told_at = now + max(rules.status_period, spread), now
     return True
 
 
