@@ -344,12 +344,13 @@ def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-u
         its_source, row, column = source_and_tile(wanted[entry])
         if its_source != head:
             continue
-        note, cost = notes[row * tile_columns + column], np.int64(0)
+        note = notes[row * tile_columns + column]
         if is_sketch:
-            cost = packed_tile_bytes(cells, row * TILE, column * TILE)
-        elif note.cost_version != held[row, column]:
-            note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), held[row, column]
-        cost = cost if is_sketch else np.int64(note.cost)
+            cost = np.int64(packed_tile_bytes(cells, row * TILE, column * TILE))
+        else:
+            if note.cost_version != held[row, column]:
+                note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), held[row, column]
+            cost = np.int64(note.cost)
         reserved += cost + _RESERVED_TILE
         if reserved > _MAX_PAYLOAD or count == _MOST_TILES or node.tiles + count == slots:
             break
