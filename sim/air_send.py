@@ -329,6 +329,16 @@ def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[n
 
 
 @numba.njit(cache=True, nogil=True)
+def _tile_cost(note, cells, row, column, version, is_sketch):  # type: ignore[no-untyped-def]
+    """Return what a tile's cells cost in bytes; of a version that was noted once, as noted, but not of a sketch."""
+    if is_sketch:
+        return np.int64(packed_tile_bytes(cells, row * TILE, column * TILE))
+    if note.cost_version != version:
+        note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), version
+    return np.int64(note.cost)
+
+
+@numba.njit(cache=True, nogil=True)
 def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-untyped-def]
     """Send the head of the queue: one datagram of one source's tiles; False when bytes or rings run short."""
     node, wanted = air.nodes[world, drone], air.wanted[world, drone]
@@ -344,13 +354,7 @@ def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-u
         its_source, row, column = source_and_tile(wanted[entry])
         if its_source != head:
             continue
-        note = notes[row * tile_columns + column]
-        if is_sketch:
-            cost = np.int64(packed_tile_bytes(cells, row * TILE, column * TILE))
-        else:
-            if note.cost_version != held[row, column]:
-                note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), held[row, column]
-            cost = np.int64(note.cost)
+        cost = _tile_cost(notes[row * tile_columns + column], cells, row, column, held[row, column], is_sketch)
         reserved += cost + _RESERVED_TILE
         if reserved > _MAX_PAYLOAD or count == _MOST_TILES or node.tiles + count == slots:
             break
