@@ -23,7 +23,7 @@ from imagine.core.frames import IDENTITY, Pose
 from imagine.core.lidar import LidarSpec, Scan
 from imagine.core.peer_marks import add_marks_ahead, write_tile
 from imagine.core.placed_layer import PlacedLayer
-from imagine.core.raster import CELL, TILE, beam_directions, integrate_scan, mark_scan, ray_table, sum_layers
+from imagine.core.raster import CELL, LIMIT, TILE, beam_directions, integrate_scan, mark_scan, ray_table, sum_layers
 
 _NEVER = 2**40  # no version is so late
 
@@ -222,6 +222,27 @@ class EvidenceMap:
         if taken:
             layer.clock = max(layer.clock, version)
         return bool(taken)
+
+    def sketch_tile(self, source: int, key: TileKey, version: int, cells: NDArray[np.int8]) -> bool:
+        """Fill in cells without evidence from a copy of a tile that holds scans of a source heard by a third.
+
+        `version` is what the copy was drawn on: it tells nothing where a later one is held. The tile turns provisional;
+        tells whether any cell was filled in. Raises InputError as `merge_tile`.
+        """
+        if source == self.own:
+            raise InputError(f"a sketch of source {source} came from outside, but only drone {source} writes it")
+        if cells.shape != (TILE, TILE) or cells.dtype != np.int8 or cells.max() > LIMIT or cells.min() < -LIMIT:
+            raise InputError(f"sketch {tuple(key)} of source {source} is no int8 {TILE}x{TILE} tile within its bounds")
+        self._cover_tiles(key.column, key.row, key.column, key.row)
+        layer = self.layer(source)
+        row, column = key.row - self.corner.row, key.column - self.corner.column
+        held = self.tile(source, key)
+        new = (held == 0) & (cells != 0)
+        if version < layer.versions[row, column] or not new.any():
+            return False
+        held[new] = cells[new]
+        layer.provisional[row, column] = True
+        return True
 
     def place(self, source: int, pose: Pose | None) -> None:
         """Say where a source's frame lies in the drone's own (metres, radians), or (None) that it is not known.

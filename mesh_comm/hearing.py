@@ -7,7 +7,7 @@ import logging
 from imagine.core.errors import InputError
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.codec import unpack_tile
-from imagine.mesh_comm.messages import GROUND, Command, Digest, Message, Status, Tiles, tile_key
+from imagine.mesh_comm.messages import GROUND, Command, Digest, Here, Message, Sketch, Status, Tiles, tile_key
 from imagine.mesh_comm.node_state import NodeState
 from imagine.mesh_comm.peers import PeerRecord
 from imagine.mesh_comm.seal import Opened, Rejected
@@ -49,7 +49,7 @@ class Hearing:
             return
         if sender == GROUND and not isinstance(message, Digest):
             raise InputError("the ground sends digests and commands only")
-        if isinstance(message, messages.Scan | Status):
+        if isinstance(message, messages.Scan | Status | Here):
             named = message.sender if isinstance(message, messages.Scan) else message.id
             if named != sender:
                 raise InputError(f"a message of {named}")
@@ -65,6 +65,8 @@ class Hearing:
         match message:
             case Status():
                 peer.note_status(message, now)
+            case Here():
+                peer.note_here(message, now)
             case Digest():
                 peer.note_digest(message, now, state.settings.max_sources)
                 state.exchange.receipts.settle(sender, peer.holds, now)
@@ -75,6 +77,9 @@ class Hearing:
             case Tiles():
                 if takes_maps:
                     self._take_tiles(message, peer, now)
+            case Sketch():
+                if takes_maps:
+                    self._take_sketch(message, sender, now)
 
     def _take_tiles(self, message: Tiles, peer: PeerRecord, now: float) -> None:
         state, source = self._state, message.source
@@ -94,6 +99,15 @@ class Hearing:
         if source != state.id:
             for tile in message.tiles:
                 state.exchange.note_overheard(source, tile, now)
+
+    def _take_sketch(self, message: Sketch, via: int, now: float) -> None:
+        state, source = self._state, message.source
+        if message.boot < state.boot(source) or (source == state.id and message.boot != state.sealer.boot):
+            state.dropped["old-life"] += 1
+        elif source == state.id or state.peers.is_live(source, now):
+            return  # nobody knows it better than the source, which is heard here
+        elif state.id == GROUND or state.settings.protocol == "multi-hop":
+            state.maps.take_sketch(message, via, now)
 
     def _renew(self, source: int, boot: int) -> None:
         """Take it that a peer is in start number `boot`: what an earlier one saw, from where it was, counts no more."""

@@ -14,10 +14,8 @@ FRONTIER_WORTH = 4
 """A free cell beside unknown ones is worth so many cells more: it tells where to go on, or that nobody need."""
 TYPICAL_TILE_BYTES = 80
 """A packed tile of a flight, where its own size is not known yet."""
-SCAN_NEWS_CELLS = 4
-"""A scan goes out at once where it shows so many cells that no scan before it told of."""
-FEW_NEWS_S, NO_NEWS_S = 0.5, 2.0
-"""So long after the last scan one goes out that shows fewer, or none and only changes what is known."""
+NO_NEWS_S = 2.0
+"""So long after the last scan one goes out that shows no cell but what scans before it told, and only changes it."""
 _SCALE = 64
 MOST_DENSITY = 2**20 - 1
 """No tile ranks higher: all cells of a tile at the frontier, new to 31 peers, for 20 bytes."""

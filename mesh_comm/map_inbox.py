@@ -12,7 +12,7 @@ from imagine.core.raster import CELL
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.codec import unpack_tile
 from imagine.mesh_comm.known_cells import KnownCells
-from imagine.mesh_comm.messages import Tiles, tile_key
+from imagine.mesh_comm.messages import Sketch, Tiles, tile_key
 from imagine.mesh_comm.provenance import CellProvenance, Provenance
 from imagine.mesh_comm.scan_exchange import draw_peer_scan
 from imagine.mesh_comm.settings import MeshSettings
@@ -90,6 +90,24 @@ class MapInbox:
         finally:  # a tile too far away to hold ends a message, and those before it are taken
             if taken:
                 self.map_cells += self._known.claim_tiles(message.source, list(taken))
+
+    def take_sketch(self, message: Sketch, via: int, now: float) -> None:
+        """Fill in what node `via` heard of a source that is out of reach here. Raises InputError with none taken."""
+        unpacked = [unpack_tile(tile.packed) for tile in message.tiles]
+        if not self.renew(message.source, message.boot):
+            return
+        if self._own_counted != self._own_clock:
+            self.own_cells += self._known.claim_tiles(message.source, list({tile_key(tile) for tile in message.tiles}))
+        filled: dict[TileKey, None] = {}
+        try:
+            for tile, cells in zip(message.tiles, unpacked, strict=True):
+                key = tile_key(tile)
+                if self._evidence.sketch_tile(message.source, key, tile.version, cells):
+                    self._provenance.note_sketch(message.source, key, via, now)
+                    filled[key] = None
+        finally:  # as with tiles
+            if filled:
+                self.scan_cells += self._known.claim_tiles(message.source, list(filled))
 
     def note_placed(self) -> None:
         """Count what became known because a peer's map found its place, as cells that its tiles made known."""

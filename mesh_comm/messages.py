@@ -63,11 +63,11 @@ class Scan(Struct, tag=1, array_like=True, frozen=True):
 
 
 class Tile(Struct, array_like=True, frozen=True):
-    """One tile of a source's layer: place, version, and its cells packed by `codec.pack_tile`."""
+    """One tile of a source's layer: place, version (0 in sketches only), and its cells packed by `codec.pack_tile`."""
 
     column: Column
     row: Column
-    version: Annotated[int, Meta(ge=1, le=2**31)]
+    version: Annotated[int, Meta(ge=0, le=2**31)]
     packed: bytes
 
 
@@ -145,11 +145,33 @@ class Command(Struct, tag=5, array_like=True, frozen=True):
     starts: Annotated[dict[SourceId, Boot], Meta(max_length=MOST_NAMED)] = {}
 
 
+class Here(Struct, tag=6, array_like=True, frozen=True):
+    """Where a drone is, between its statuses; `velocity` in the map frame, m/s."""
+
+    id: NodeId
+    stamp: float
+    pose: Pose
+    velocity: tuple[float, float]
+
+
+class Sketch(Struct, tag=7, array_like=True, frozen=True):
+    """Tiles of a source that is out of reach, with the scans drawn over them that the sender heard of it.
+
+    Nothing of it is confirmed: it tells of cells that the receiver has no evidence of, until the tiles themselves come.
+    The version of a tile is that of the confirmed copy under the scans, 0 where there is none; whoever holds a later
+    one knows better.
+    """
+
+    source: SourceId
+    tiles: Annotated[list[Tile], Meta(max_length=256)]
+    boot: Boot
+
+
 ACTIONS = ("hold", "land", "resume")
 SAFE_ACTIONS = ("hold", "land")
 """Orders that a drone obeys even where the ground does not know it."""
 
-Message = Scan | Tiles | Digest | Status | Command
+Message = Scan | Tiles | Digest | Status | Command | Here | Sketch
 _FIELDS = {kind.__struct_config__.tag: 1 + len(kind.__struct_fields__) for kind in get_args(Message)}
 
 
@@ -257,13 +279,20 @@ def _check(message: Message) -> None:
                 _check_bound("status: time", _MAX_TIME_S, age_s)
             _check_bound("status: velocity", MAX_SPEED_MPS, math.hypot(*message.velocity))
             _check_bound("status: height", _MAX_HEIGHT_M, message.height_m)
+        case Here():
+            _check_pose(message.pose)
+            _check_bound("here: time", _MAX_TIME_S, message.stamp)
+            _check_bound("here: velocity", MAX_SPEED_MPS, math.hypot(*message.velocity))
         case Digest():
             _check_bound("digest: stamp", _MAX_TIME_S, message.stamp)
         case Command():
             if message.action not in ACTIONS:
                 raise Unreadable("malformed", f"mesh command '{message.action}', expected one of {', '.join(ACTIONS)}")
-        case Tiles():
-            pass  # each tile's cells are checked when they are unpacked
+        case Tiles():  # each tile's cells are checked when they are unpacked
+            if any(tile.version < 1 for tile in message.tiles):
+                raise Unreadable("malformed", "mesh tile of version 0, which only sketches have")
+        case Sketch():
+            pass
 
 
 def _check_bound(what: str, most: float, value: float) -> None:

@@ -12,7 +12,7 @@ from imagine.core.evidence import TileKey
 from imagine.core.frames import Pose
 from imagine.mesh_comm.codec import unpack_versions
 from imagine.mesh_comm.digest import Held
-from imagine.mesh_comm.messages import Digest, Holding, Status
+from imagine.mesh_comm.messages import Digest, Here, Holding, Status
 
 _EXTRAPOLATE_S = 1.0  # a last known velocity says little about where a peer is later than this
 
@@ -62,6 +62,12 @@ class PeerRecord:
         if self.status is None or status.stamp >= self.status.stamp or self.pose_stamp == -math.inf:
             self.status, self.velocity = status, status.velocity
         self.note_pose(status.pose, status.stamp, now)
+
+    def note_here(self, here: Here, now: float) -> None:
+        """Take where the peer is, and how fast it moves, unless a newer pose is known."""
+        if here.stamp >= self.pose_stamp:
+            self.velocity = here.velocity
+        self.note_pose(here.pose, here.stamp, now)
 
     def note_digest(self, digest: Digest, now: float, max_sources: int) -> None:
         """Take what the peer says it holds, interval by interval; an older digest than the last is left out.

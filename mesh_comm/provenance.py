@@ -13,6 +13,7 @@ from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import IDENTITY, inverse, transform_points
 from imagine.core.raster import CELL, LIMIT, TILE
 
+_NOBODY = -1
 Way = Literal["own scan", "scan", "tile", "relay"]
 
 
@@ -54,6 +55,7 @@ class _Arrival(NamedTuple):
     tile_at: float | None = None
     stamp: float | None = None
     scan_at: float | None = None
+    sketch_via: int | None = None
 
 
 class _Arrivals:
@@ -64,13 +66,14 @@ class _Arrivals:
         self.corner = corner
         self.version = np.zeros(shape, np.int64)
         self.via = np.zeros(shape, np.uint8)
+        self.sketch_via = np.full(shape, _NOBODY, np.int16)
         self.tile_at, self.stamp, self.scan_at = np.full((3, *shape), np.nan)
 
     def copy_from(self, old: _Arrivals) -> None:
         """Take over what is noted on a smaller grid."""
         row, column = old.corner.row - self.corner.row, old.corner.column - self.corner.column
         rows, columns = old.version.shape
-        for name in ("version", "via", "tile_at", "stamp", "scan_at"):
+        for name in ("version", "via", "sketch_via", "tile_at", "stamp", "scan_at"):
             getattr(self, name)[row : row + rows, column : column + columns] = getattr(old, name)
 
     def at(self, key: TileKey) -> _Arrival:
@@ -82,7 +85,9 @@ class _Arrivals:
             None if math.isnan(value) else value
             for value in map(float, (self.tile_at[row, column], self.stamp[row, column], self.scan_at[row, column]))
         )
-        return _Arrival(int(self.version[row, column]), int(self.via[row, column]), tile_at, stamp, scan_at)
+        via = int(self.sketch_via[row, column])
+        sketch_via = None if via == _NOBODY else via
+        return _Arrival(int(self.version[row, column]), int(self.via[row, column]), tile_at, stamp, scan_at, sketch_via)
 
 
 class Provenance:
@@ -118,12 +123,19 @@ class Provenance:
         arrivals = self._of(source)
         np.copyto(arrivals.stamp[reached], stamp, where=provisional)
         np.copyto(arrivals.scan_at[reached], now, where=provisional)
+        arrivals.sketch_via[reached][provisional] = _NOBODY
 
     def note_tile(self, source: int, key: TileKey, version: int, via: int, now: float) -> None:
         """Note a tile that was taken into the map, heard from node `via`."""
         arrivals = self._of(source)
         at = key.row - arrivals.corner.row, key.column - arrivals.corner.column
         arrivals.version[at], arrivals.via[at], arrivals.tile_at[at] = version, via, now
+
+    def note_sketch(self, source: int, key: TileKey, via: int, now: float) -> None:
+        """Note that node `via` filled in cells of a tile from scans of the source that it heard."""
+        arrivals = self._of(source)
+        at = key.row - arrivals.corner.row, key.column - arrivals.corner.column
+        arrivals.sketch_via[at], arrivals.scan_at[at] = via, now
 
     def forget(self, source: int) -> None:
         """Drop what is noted of a source, whose layer was dropped."""
@@ -171,6 +183,9 @@ class Provenance:
         if source == evidence.own:
             return Sighting(source, units, "own scan", source, arrival.version, arrival.stamp, arrival.scan_at, False)
         if arrival.version == 0 or (provisional and (arrival.scan_at or 0.0) >= (arrival.tile_at or 0.0)):
+            if provisional and arrival.sketch_via is not None:
+                via = arrival.sketch_via
+                return Sighting(source, units, "relay", via, arrival.version, arrival.stamp, arrival.scan_at, True)
             return Sighting(source, units, "scan", source, arrival.version, arrival.stamp, arrival.scan_at, provisional)
         way: Way = "tile" if arrival.via == source else "relay"
         return Sighting(source, units, way, arrival.via, arrival.version, arrival.stamp, arrival.tile_at, provisional)

@@ -64,6 +64,12 @@ class Receipts:
         while len(self._open) > _MOST_OPEN:
             self._close(*next(iter(self._open)), lost=True)
 
+    def note_sketch(self, size: int, told: Mapping[int, int]) -> None:
+        """Take a tile of a source out of reach that went out in `size` bytes: an estimate, as scans are."""
+        receipt = self.by_kind["tile"]
+        receipt.bytes += size
+        receipt.cells += sum(told.values())
+
     def settle(self, peer: int, holds: Callable[[int, int, TileKey], float], now: float) -> None:
         """Look through what was sent to a peer, after a digest: `holds` as `PeerRecord.holds`."""
         for to, source, key in [entry for entry in self._open if entry[0] == peer]:

@@ -30,7 +30,10 @@ class MeshSettings(Settings):
     rate_bytes_per_s: float = Field(default=31250.0, gt=0.0, description="bytes a second this node may send, sealed")
     burst_bytes: float = Field(default=6250.0, ge=1200.0, description="bytes it may send at once after a silence")
     scheduler: Scheduler = "information"
-    status_period_s: float = Field(default=0.5, gt=0.0)
+    status_period_s: float = Field(default=1.0, gt=0.0)
+    pose_period_s: float = Field(default=0.5, gt=0.0, description="at least once a period a drone tells where it is")
+    near_m: float = Field(default=3.0, ge=0.0, description="a peer this close is near")
+    near_pose_period_s: float = Field(default=0.2, gt=0.0, description="and as often while a peer is near")
     digest_period_s: float = Field(default=0.5, gt=0.0)
     scan_period_s: float = Field(default=0.1, gt=0.0, description="at most one scan is sent per period")
     tile_period_s: float = Field(default=1.0, gt=0.0, description="the same tile is sent at most once per period")

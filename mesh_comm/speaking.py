@@ -13,8 +13,8 @@ from imagine.core.lidar import LidarSpec, Scan, mask_near
 from imagine.mesh_comm import messages
 from imagine.mesh_comm.budget import TokenBucket
 from imagine.mesh_comm.digest import Held, digests
-from imagine.mesh_comm.information import FEW_NEWS_S, NO_NEWS_S, SCAN_NEWS_CELLS
-from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Digest, Message, Status
+from imagine.mesh_comm.information import NO_NEWS_S
+from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Digest, Here, Message, Status
 from imagine.mesh_comm.node_state import NodeState
 from imagine.mesh_comm.receipts import Bought
 from imagine.mesh_comm.scan_exchange import scan_message
@@ -23,6 +23,8 @@ from imagine.mesh_comm.tile_exchange import Wanted
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4  # of a longer digest, this many go out per period, in turn
 _DIGEST_SHARE, _MOST_DIGEST_S = 0.125, 1.5  # where bytes are short, digests take so much of them, or come so late
+_STATUS_SHARE, _MOST_STATUS_S = 0.125, 2.0  # so do statuses
+_HERE_SHARE, _MOST_HERE_S = 0.2, 1.0  # and poses between them, well within a peer's timeout
 _SCANS_BEFORE_NEWS, _SCANS_BEFORE_REPEATS = 1, 4  # where bytes are short, so many scans go before a message of tiles
 _TOLD: tuple[Bought, ...] = ("scan", "tile")
 _EPSILON_S = 1e-6  # periods are whole ticks: rounding of their sum must not cost a tick
@@ -54,6 +56,8 @@ class Speaking:
         self._scan_since = self._scan_sent_at = -np.inf
         self._scans_ahead = 1
         self._cells_told = 0
+        self._pose_told_at, self._here_bytes = -np.inf, 0
+        self._order_told = 0
 
     def offer_scan(self, scan: Scan, pose: Pose, now: float) -> None:
         """Offer the own scan, taken at `pose` and integrated before; see `MeshNode.offer_scan`."""
@@ -75,9 +79,9 @@ class Speaking:
     def _is_worth_telling(self, now: float) -> bool:
         """Tell whether what own scans have made known since the last one that was sent is worth another."""
         news = self._maps.own_cells - self._cells_told
-        if self._settings.scheduler == "fifo" or news >= SCAN_NEWS_CELLS:
+        if self._settings.scheduler == "fifo" or news > 0:
             return True
-        return now >= self._scan_sent_at + (FEW_NEWS_S if news > 0 else NO_NEWS_S) - _EPSILON_S
+        return now >= self._scan_sent_at + NO_NEWS_S - _EPSILON_S
 
     def set_status(self, status: Status) -> None:
         """Set what the next status message tells; cells, bytes, links, rejections and command are filled in."""
@@ -95,7 +99,8 @@ class Speaking:
             self._maps.note_placed()
         self._prepare(now)
         for step in (
-            self._send_claim, self._send_commands, self._send_status, self._send_digests, self._send_maps,
+            self._send_claim, self._send_commands, self._send_status, self._send_here, self._send_digests,
+            self._send_maps,
         ):  # fmt: skip
             if not step(out, now):
                 break  # out of bytes: what is left keeps its place
@@ -146,8 +151,9 @@ class Speaking:
         return True
 
     def _send_status(self, out: list[bytes], now: float) -> bool:
-        if self._status is None or now < self._next_status - _EPSILON_S:
-            return True
+        order = self._state.orders.last_nonce
+        if self._status is None or (now < self._next_status - _EPSILON_S and order == self._order_told):
+            return True  # that an order came is told at once
         full = msgspec.structs.replace(
             self._status,
             own_cells=self._maps.own_cells,
@@ -156,13 +162,41 @@ class Speaking:
             bytes_sent=dict(self.bytes_sent),
             links=self._peers.ages(now, most=32),
             rejected=sum(self._state.stats.values()),
-            last_command=self._state.orders.last_nonce,
+            last_command=order,
             taught={kind: self._exchange.receipts.by_kind[kind].cells for kind in _TOLD},
         )
         if not self._send(full, "status", out, now):
             return False
-        self._next_status = now + self._settings.status_period_s
+        spread_s = self._spread_s(len(out[-1]), _STATUS_SHARE, _MOST_STATUS_S)
+        self._next_status, self._pose_told_at = now + max(self._settings.status_period_s, spread_s), now
+        self._order_told = order
         return True
+
+    def _send_here(self, out: list[bytes], now: float) -> bool:
+        """Tell the pose where no status or scan has told it lately, more often to peers that are near."""
+        if self._status is None:
+            return True
+        settings, pose = self._settings, self._status.pose
+        period_s = settings.pose_period_s
+        if self._scan is None and self._is_near(pose, now):  # a scan that waits will tell it
+            period_s = min(period_s, settings.near_pose_period_s)
+        period_s = max(period_s, self._spread_s(self._here_bytes, _HERE_SHARE, _MOST_HERE_S))
+        if now < self._pose_told_at + period_s - _EPSILON_S:
+            return True
+        if not self._send(Here(self._id, self._status.stamp, pose, self._status.velocity), "status", out, now):
+            return False
+        self._pose_told_at, self._here_bytes = now, len(out[-1])
+        return True
+
+    def _spread_s(self, size: int, share: float, most_s: float) -> float:
+        """Return how long to wait after `size` bytes so that their kind takes `share` of the rate, at most `most_s`."""
+        if self._settings.scheduler == "fifo":
+            return 0.0
+        return min(most_s, size / (share * self._settings.rate_bytes_per_s))
+
+    def _is_near(self, pose: Pose, now: float) -> bool:
+        away = self._peers.positions(now) - np.array(pose[:2])
+        return bool((np.hypot(away[:, 0], away[:, 1]) <= self._settings.near_m).any())
 
     def _send_digests(self, out: list[bytes], now: float) -> bool:
         while self._digests:
@@ -170,9 +204,8 @@ class Speaking:
                 return False
             self._digests.popleft()
             self._digest_bytes += len(out[-1])
-            if self._settings.scheduler == "information":
-                spread_s = self._digest_bytes / (_DIGEST_SHARE * self._settings.rate_bytes_per_s)
-                self._next_digest = max(self._next_digest, self._digest_at + min(_MOST_DIGEST_S, spread_s))
+            spread_s = self._spread_s(self._digest_bytes, _DIGEST_SHARE, _MOST_DIGEST_S)
+            self._next_digest = max(self._next_digest, self._digest_at + spread_s)
         return True
 
     def _send_maps(self, out: list[bytes], now: float) -> bool:
@@ -204,6 +237,7 @@ class Speaking:
         self._scan_clock = self._scan.clock
         self._scan = None
         self._scan_sent_at, self._next_scan = now, now + self._settings.scan_period_s
+        self._pose_told_at = now
         return True
 
     def _send_tiles(self, out: list[bytes], now: float) -> bool:

@@ -12,8 +12,15 @@ from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import IDENTITY
 from imagine.core.raster import TILE
 from imagine.mesh_comm.codec import pack_tile
-from imagine.mesh_comm.information import TYPICAL_TILE_BYTES, density, known_cells, tile_news, unsent_share
-from imagine.mesh_comm.messages import GROUND, Tile, Tiles, tile_key
+from imagine.mesh_comm.information import (
+    FRONTIER_WORTH,
+    TYPICAL_TILE_BYTES,
+    density,
+    known_cells,
+    tile_news,
+    unsent_share,
+)
+from imagine.mesh_comm.messages import GROUND, Sketch, Tile, Tiles, tile_key
 from imagine.mesh_comm.peers import PeerRecord
 from imagine.mesh_comm.receipts import Receipts
 from imagine.mesh_comm.settings import MeshSettings
@@ -42,7 +49,10 @@ class _Sent(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """A tile that peers lack, since when; `told`: the cells it would tell each of them, `worth` so much in all."""
+    """A tile that peers lack, since when; `told`: the cells it would tell each of them, `worth` so much in all.
+
+    `is_sketch`: it goes out as it is drawn here, with scans that its source confirms no more.
+    """
 
     rank: tuple[float, ...]
     source: int
@@ -51,6 +61,7 @@ class Wanted(NamedTuple):
     told: dict[int, int]
     worth: int
     known: int
+    is_sketch: bool = False
 
     @property
     def brings_news(self) -> bool:
@@ -70,6 +81,7 @@ class TileExchange:
         self._packed: dict[TileKey, Content] = {}
         self._sent: dict[tuple[int, TileKey], _Sent] = {}
         self._since: dict[tuple[int, TileKey], float] = {}
+        self._sketched: dict[tuple[int, int, TileKey], int] = {}
         self._queue: list[Wanted] = []
         self._next_repeats = -np.inf
 
@@ -94,6 +106,7 @@ class TileExchange:
         """Drop the tiles of a source that has started anew."""
         self._confirmed.pop(source, None)
         self._sent = {of: sent for of, sent in self._sent.items() if of[0] != source}
+        self._sketched = {of: known for of, known in self._sketched.items() if of[1] != source}
         self._queue = [wanted for wanted in self._queue if wanted.source != source]
 
     def note_overheard(self, source: int, tile: Tile, now: float) -> None:
@@ -139,35 +152,42 @@ class TileExchange:
         self._since = {(tile.source, tile.key): tile.since for tile in wanted}
         if not repeats:
             wanted = [tile for tile in wanted if tile.worth > 0]
-        wanted.sort(key=lambda tile: (tile.rank, tile.source, tile.key))
+        wanted += self._sketches(peers, now)
+        wanted.sort(key=lambda tile: (tile.rank, tile.is_sketch, tile.source, tile.key))
         self._queue = wanted[:_MOST_WANTED]
 
-    def next_message(self, max_bytes: int) -> Tiles | None:
+    def next_message(self, max_bytes: int) -> Tiles | Sketch | None:
         """Return the most wanted tiles of one source, as many as fit, without taking them off the queue."""
         if not self._queue:
             return None
-        source = self._queue[0].source
+        source, is_sketch = self._queue[0].source, self._queue[0].is_sketch
         tiles: list[Tile] = []
         size = _TILES_BYTES
         for wanted in self._queue:
-            if wanted.source != source:
+            if wanted.source != source or wanted.is_sketch != is_sketch:
                 continue
-            held = self._content(source, wanted.key)
+            held = self._drawn(source, wanted.key) if is_sketch else self._content(source, wanted.key)
             size += len(held.packed) + _TILE_BYTES
             if size > max_bytes or len(tiles) == 256:
                 break
             tiles.append(Tile(wanted.key.column, wanted.key.row, held.version, held.packed))
-        return Tiles(source, tiles, self._evidence.layers[source].boot)
+        boot = self._evidence.layers[source].boot
+        return Sketch(source, tiles, boot) if is_sketch else Tiles(source, tiles, boot)
 
-    def note_sent(self, message: Tiles, size: int, now: float) -> None:
+    def note_sent(self, message: Tiles | Sketch, size: int, now: float) -> None:
         """Take the tiles of a message that went out, in `size` sealed bytes, off the queue."""
         gone = {tile_key(tile): tile for tile in message.tiles}
         packed = max(1, sum(len(tile.packed) for tile in message.tiles))
         left: list[Wanted] = []
         for wanted in self._queue:
-            tile = gone.get(wanted.key) if wanted.source == message.source else None
+            is_of = wanted.source == message.source and wanted.is_sketch == isinstance(message, Sketch)
+            tile = gone.get(wanted.key) if is_of else None
             if tile is None:
                 left.append(wanted)
+                continue
+            if wanted.is_sketch:
+                self._sketched |= {(peer, wanted.source, wanted.key): wanted.known for peer in wanted.told}
+                self.receipts.note_sketch(round(size * len(tile.packed) / packed), wanted.told)
                 continue
             self._sent[message.source, wanted.key] = _Sent(tile.version, now, wanted.known)
             self._since.pop((wanted.source, wanted.key), None)
@@ -176,6 +196,42 @@ class TileExchange:
                 message.source, message.boot, wanted.key, tile.version, share, wanted.told, now
             )  # fmt: skip
         self._queue = left
+
+    def _sketches(self, peers: Sequence[PeerRecord], now: float) -> list[Wanted]:
+        """Return the tiles of sources out of reach that hold scans of theirs which some of `peers` may not have heard.
+
+        What a source said last before it left is confirmed by nobody until it is met again. Each goes to a peer once
+        as long as the two are in touch.
+        """
+        evidence, here = self._evidence, {peer.id for peer in peers}
+        if self._settings.protocol != "multi-hop":
+            return []
+        self._sketched = {of: known for of, known in self._sketched.items() if of[0] in here}
+        wanted: list[Wanted] = []
+        for source, layer in evidence.layers.items():
+            if source == evidence.own or source in here:
+                continue
+            for row, column in np.argwhere(layer.provisional).tolist():
+                key = TileKey(column + evidence.corner.column, row + evidence.corner.row)
+                told, worth, known = {}, 0, self._known(source, key)
+                for peer in peers:
+                    # a copy that the peer still lacks would overwrite the sketch: that goes first
+                    holds_same = peer.holds(source, layer.boot, key) == layer.versions[row, column]
+                    if not holds_same or self._sketched.get((peer.id, source, key), 0) >= known:
+                        continue
+                    fresh, edge, _ = self._unseen(source, key, peer)
+                    told[peer.id] = fresh
+                    worth += fresh + FRONTIER_WORTH * edge
+                if worth > 0:
+                    is_fifo = self._settings.scheduler == "fifo"
+                    rank = (now,) if is_fifo else (0, -int(density(worth, TYPICAL_TILE_BYTES)), True)
+                    wanted.append(Wanted(rank, source, key, now, told, worth, known, is_sketch=True))
+        return wanted
+
+    def _drawn(self, source: int, key: TileKey) -> Content:
+        layer, corner = self._evidence.layers[source], self._evidence.corner
+        version = int(layer.versions[key.row - corner.row, key.column - corner.column])
+        return Content(version, pack_tile(self._evidence.tile(source, key)))
 
     def _ranked(
         self, source: int, key: TileKey, missing: int, stale: int, lacking: list[tuple[PeerRecord, int]], now: float
@@ -205,6 +261,13 @@ class TileExchange:
         own = self._evidence.own
         if source == own and held >= (peer.met or {}).get(key, 0):
             return 0, 0, 0
+        fresh, edge, known = self._unseen(source, key, peer)
+        last = self._sent.get((source, key))
+        told, worth = unsent_share(fresh, edge, known, last.known if last is not None and held > 0 else 0)
+        return int(told), int(worth), int(known)
+
+    def _unseen(self, source: int, key: TileKey, peer: PeerRecord) -> tuple[int, int, int]:
+        """Return (fresh, edge, known) of a tile, as `tile_news`: what a peer's own map does not show of it."""
         corner = self._evidence.corner
         cells = self._evidence.layers[source].cells
         theirs = self._evidence.layers.get(peer.id)
@@ -213,9 +276,7 @@ class TileExchange:
             cells, (key.row - corner.row) * TILE, (key.column - corner.column) * TILE,
             theirs.cells if theirs is not None and sees else _NOTHING,
         )  # fmt: skip
-        last = self._sent.get((source, key))
-        told, worth = unsent_share(fresh, edge, known, last.known if last is not None and held > 0 else 0)
-        return int(told), int(worth), int(known)
+        return int(fresh), int(edge), int(known)
 
     def _known(self, source: int, key: TileKey) -> int:
         return int(known_cells(self._evidence.tile(source, key), 0, 0))

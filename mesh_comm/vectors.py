@@ -29,7 +29,18 @@ from imagine.mesh_comm.codec import (
     unpack_tile,
     unpack_versions,
 )
-from imagine.mesh_comm.messages import Command, Digest, Holding, Message, Scan, Status, Tile, Tiles
+from imagine.mesh_comm.messages import (
+    Command,
+    Digest,
+    Here,
+    Holding,
+    Message,
+    Scan,
+    Sketch,
+    Status,
+    Tile,
+    Tiles,
+)
 from imagine.mesh_comm.seal import Sealer
 
 KEY = bytes(range(32))
@@ -59,6 +70,8 @@ def samples() -> list[tuple[int, Message]]:
         (SENDER, status),
         (SENDER, Status(SENDER, 2.5, _POSE)),
         (GROUND, Command("land", 0, 2**40, {SENDER: BOOT})),
+        (SENDER, Here(SENDER, 2.75, _POSE, (0.5, -0.25))),
+        (SENDER, Sketch(2, [Tile(-2, 1, 0, pack_tile(_wall())), tiles[2]], 3)),
     ]
 
 
@@ -93,7 +106,7 @@ def content(message: Message) -> dict[str, Any]:
             del fields["packed"]
             ranges = unpack_ranges(message.packed, message.beams, message.range_cap_m)
             fields["codes"] = range_codes(ranges, 0.0, message.range_cap_m).tolist()
-        case Tiles():
+        case Tiles() | Sketch():
             fields["tiles"] = [
                 {**_fields(tile), "packed": tile.packed.hex(), "cells": unpack_tile(tile.packed).tolist()}
                 for tile in message.tiles

@@ -52,12 +52,14 @@ NODE = _record(
     first_message=_INT, messages=_INT, busy_slots=_INT, scans=_INT,
     first_tile=_INT, tiles=_INT, first_digest=_INT, digests=_INT, scans_ahead=_INT,
     claimed_clock=_INT, told_cells=_INT, next_repeats=_FLOAT, digest_at=_FLOAT, digest_bytes=_INT,
+    pose_told_at=_FLOAT, readers=_INT,
 )  # fmt: skip
 """What a drone's mesh node keeps: `tokens` bytes left to send, `busy_until` and `next_...` seconds, `pending_...` of a
 scan that waits to be sent (clock 0 for none); `canvas` the slot of scans that the next one is drawn in; `busy_slots` a
 bit for each slot in flight; `wanted` tiles are queued; `scans_ahead` scans went out while they waited; own cells are
 counted up to `claimed_clock`, and `told_cells` of them were by the last scan sent; the last digest
-was begun at `digest_at` and took `digest_bytes`; rings have a first and a count. `dropped` messages found the
+was begun at `digest_at` and took `digest_bytes`; the own pose was told at `pose_told_at`; `readers` has a bit for
+each peer that the last plan was for; rings have a first and a count. `dropped` messages found the
 radio's queue full."""
 PEER = _record(
     heard_tick=_INT, pose_tick=_INT, status_tick=_INT, digest_tick=_INT, hears=_INT,
@@ -72,8 +74,8 @@ MESSAGE = _record(
     kind=np.int32, size=np.int32, slot=np.int32, source=np.int32, count=np.int32,
     first_unit=np.int32, last_unit=np.int32,
 )  # fmt: skip
-"""A message in flight. `slot` belongs to scans, `source` and `count` to tiles, the units to digests, `hears` and the
-velocity to statuses."""
+"""A message in flight. `slot` belongs to scans; of tiles 1 says that they are sketches, and of statuses that only the
+pose is told. `source` and `count` belong to tiles, the units to digests, `hears` and the velocity to statuses."""
 WINDOW = _record(row=_INT, column=_INT, clock=_INT, x=_FLOAT, y=_FLOAT, yaw=_FLOAT)
 """A scan in flight: the grid's row and column of its first mark (a whole number of tiles; both may lie off the grid),
 the sender's clock after the scan, and its pose."""
@@ -102,6 +104,9 @@ class AirRules(NamedTuple):
     budget_rate: float
     burst: float
     status_period: float
+    pose_period: float
+    near_pose_period: float
+    near: float
     digest_period: float
     scan_period: float
     tile_period: float
@@ -124,6 +129,7 @@ class AirState(NamedTuple):
     (`tile_cells` int8, `tile_keys` place and version) and of digests (uint32 `[..., source, tile]`); `holdings` uint32
     `[..., peer, source, tile]` the versions that peers are known to hold, and `met` uint32 `[..., peer, tile]` the own
     versions when a peer came into reach; `notes` TILE_NOTE `[..., source, tile]`;
+    `sketched` int16 `[..., peer, source, tile]` the cells of what was passed on unconfirmed, only for relays;
     `wanted` int64 the queue of tiles; `known` int8 `[..., row, column]` the cells that ever had evidence; `confirmed`
     int8 `[..., source, row, column]` the cells of tiles as their source sent them, kept only for passing on.
     """
@@ -145,6 +151,7 @@ class AirState(NamedTuple):
     holdings: NDArray[np.uint32]
     met: NDArray[np.uint32]
     notes: NDArray[np.void]
+    sketched: NDArray[np.int16]
     wanted: NDArray[np.int64]
     known: NDArray[np.int8]
     confirmed: NDArray[np.int8]
@@ -196,7 +203,7 @@ class Air:
             self.state.peers[world][never] = NEVER
         self.state.notes[world]["sent_tick"] = NEVER
         nodes = self.state.nodes[world]
-        nodes["digest_at"] = -np.inf
+        nodes["digest_at"] = nodes["pose_told_at"] = -np.inf
         nodes["scans_ahead"] = 1
         nodes["canvas"] = nodes["pending_slot"] = -1
         nodes["tokens"] = self.rules.burst
@@ -237,6 +244,9 @@ def _rules(radio: RadioSettings, mesh: MeshSettings, lidar: LidarSpec, range_cap
         budget_rate=mesh.rate_bytes_per_s,
         burst=mesh.burst_bytes,
         status_period=mesh.status_period_s,
+        pose_period=mesh.pose_period_s,
+        near_pose_period=mesh.near_pose_period_s,
+        near=mesh.near_m,
         digest_period=mesh.digest_period_s,
         scan_period=mesh.scan_period_s,
         tile_period=mesh.tile_period_s,
@@ -280,7 +290,8 @@ def _allocate(worlds: int, drones: int, tile_rows: int, tile_columns: int, rules
         holdings=np.zeros((*per_peer, drones, tiles), np.uint32),
         met=np.zeros((*per_peer, tiles), np.uint32),
         notes=np.zeros((*per_peer, tiles), TILE_NOTE),
-        wanted=np.zeros((*per_drone, drones * tiles), np.int64),
+        sketched=np.zeros((*per_peer, drones, tiles) if rules.relays else (worlds, 1, 1, 1, 1), np.int16),
+        wanted=np.zeros((*per_drone, (2 if rules.relays else 1) * drones * tiles), np.int64),
         known=np.zeros((*per_drone, rows, columns), np.int8),
         confirmed=np.zeros((*per_peer, rows, columns) if rules.relays else (worlds, 1, 1, 1, 1), np.int8),
     )

@@ -30,6 +30,7 @@ _HOLDING_BYTES = 11  # array, source, two bounds of no interval, length of the v
 _STATUS_TEXT_BYTES = 8 + 6 + 9  # "OFFBOARD", "policy", "exploring": what a drone that explores has to tell
 _TAUGHT_BYTES = 11 + 2 * 3  # the names scan and tile, and cells of each, up to 65535
 _STATUS_BYTES = OVERHEAD + 112 + _STATUS_TEXT_BYTES + _TAUGHT_BYTES
+_HERE_BYTES = OVERHEAD + 60  # wire version, array, tag, sender, stamp, pose, velocity
 _LINK_BYTES = 10  # id and seconds
 _LOWEST, _HIGHEST = np.int8(-LIMIT), np.int8(LIMIT)
 _STEPS_A_METRE = round(1.0 / RANGE_STEP_M)
@@ -158,6 +159,12 @@ def tile_in_message_bytes(packed, version):  # type: ignore[no-untyped-def]
 def digest_message_bytes(holdings, packed):  # type: ignore[no-untyped-def]
     """Return the sealed bytes of a digest of so many holdings with `packed` bytes of version lists in all."""
     return _DIGEST_BYTES + _HOLDING_BYTES * holdings + packed
+
+
+@numba.njit(cache=True, nogil=True)
+def here_bytes():  # type: ignore[no-untyped-def]
+    """Return the sealed bytes of a message of where a drone is."""
+    return _HERE_BYTES
 
 
 @numba.njit(cache=True, nogil=True)

@@ -6,8 +6,16 @@ import numba
 import numpy as np
 
 from imagine.core.raster import TILE
-from imagine.mesh_comm.information import MOST_DENSITY, TYPICAL_TILE_BYTES, density, tile_news, unsent_share
-from imagine.sim.air import MOST_WANTED, NEVER
+from imagine.mesh_comm.information import (
+    FRONTIER_WORTH,
+    MOST_DENSITY,
+    TYPICAL_TILE_BYTES,
+    density,
+    known_cells,
+    tile_news,
+    unsent_share,
+)
+from imagine.sim.air import MOST_DRONES, MOST_WANTED, NEVER
 
 _DIGEST_GRACE_S, _EPSILON_S = 0.25, 1e-6  # as in mesh_comm.tile_exchange
 _ROWS, _PLACES, _SOURCES, _STALE, _MISSING = 1 << 12, 1 << 24, 1 << 6, 1 << 24, 1 << 6  # digits of a queue entry
@@ -81,8 +89,44 @@ def plan(air, world, tick, drone, live, layers, versions):  # type: ignore[no-un
                 place = column * _ROWS + row  # ties in the order of tile keys
                 wanted[node.wanted] = ((rank * 2 + (source != drone)) * _SOURCES + source) * _PLACES + place
                 node.wanted += 1
+    if rules.relays:
+        _plan_sketches(
+            node, readers, drone, layers, versions, holdings, air.notes[world, drone], air.sketched[world, drone],
+            wanted,
+        )  # fmt: skip
     _sort(wanted, node.wanted)
     node.wanted = min(node.wanted, MOST_WANTED)
+
+
+@numba.njit(cache=True, nogil=True)
+def _plan_sketches(node, readers, drone, layers, versions, holdings, notes, sketched, wanted):  # type: ignore[no-untyped-def]
+    """Queue the tiles with scans of sources out of reach, as `TileExchange._sketches`; `readers` has a bit a peer.
+
+    `holdings`, `notes` and `sketched` are the drone's.
+    """
+    drones, tile_columns = versions.shape[1], versions.shape[3]
+    for peer in range(drones):
+        if (node.readers & ~readers) >> peer & 1 == 1:
+            sketched[peer] = 0
+    node.readers = readers
+    for source in range(drones):
+        if readers == 0 or source == drone or (readers >> source) & 1 == 1:
+            continue
+        for tile in range(notes.shape[1]):
+            if notes[source, tile].provisional == 0:
+                continue
+            row, column = tile // tile_columns, tile % tile_columns
+            known, worth = known_cells(layers[drone, source], row * TILE, column * TILE), np.int64(0)
+            for peer in range(drones):
+                has_same = holdings[peer, source, tile] == versions[drone, source, row, column]
+                if (readers >> peer) & 1 == 0 or not has_same or np.int64(sketched[peer, source, tile]) >= known:
+                    continue
+                fresh, edge, _ = tile_news(layers[drone, source], row * TILE, column * TILE, layers[drone, peer])
+                worth += fresh + FRONTIER_WORTH * edge
+            if worth > 0:
+                rank, place = MOST_DENSITY - density(worth, TYPICAL_TILE_BYTES), column * _ROWS + row
+                wanted[node.wanted] = ((rank * 2 + 1) * _SOURCES + MOST_DRONES + source) * _PLACES + place
+                node.wanted += 1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -103,5 +147,5 @@ def _sort(values, count):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def source_and_tile(entry):  # type: ignore[no-untyped-def]
-    """Return (source, tile row, tile column) of a queue entry."""
+    """Return (source, tile row, tile column) of a queue entry; of a sketch the source is MOST_DRONES greater."""
     return entry // _PLACES % _SOURCES, entry % _ROWS, entry % _PLACES // _ROWS

@@ -99,6 +99,14 @@ def deliver(air, world, tick, key, poses, alive, segments, layers, versions, dir
                             air.known[world, receiver], air.notes[world, receiver, sender], layers[receiver, receiver],
                             layers[receiver, sender], versions[receiver, sender], dirty[receiver],
                         )  # fmt: skip
+                    elif message.slot == 1:
+                        if not is_live(air.peers[world, receiver, message.source], tick, rules):
+                            _take_sketch(
+                                air, world, sender, message, layers[receiver, receiver], air.known[world, receiver],
+                                air.counters[world, receiver], layers[receiver, message.source],
+                                versions[receiver, message.source], air.notes[world, receiver, message.source],
+                                dirty[receiver], receiver,
+                            )  # fmt: skip
                     elif message.source == sender or message.source == receiver or rules.relays:
                         _take_tiles(air, world, tick, sender, receiver, message, layers, versions, dirty)
         if message.kind == SCAN:
@@ -185,8 +193,9 @@ def _hear(peer, tick, message):  # type: ignore[no-untyped-def]
     """Note that a peer was heard, and where it says it is."""
     peer.heard_tick = tick
     if message.kind == STATUS:
-        peer.status_tick = tick
-        peer.hears, peer.vx, peer.vy = message.hears, message.vx, message.vy
+        peer.vx, peer.vy = message.vx, message.vy
+        if message.slot == 0:  # not of the pose alone
+            peer.status_tick, peer.hears = tick, message.hears
     if message.kind == STATUS or message.kind == SCAN:
         peer.pose_tick = tick
         peer.x, peer.y, peer.yaw = message.x, message.y, message.yaw
@@ -231,6 +240,35 @@ def _take_scan(window, marks, spans, counters, known, notes, own_cells, cells, v
                     notes[i * tile_columns + j].provisional = 1
                     dirty[i, j] = 1
             row = end
+
+
+@numba.njit(cache=True, nogil=True)
+def _take_sketch(air, world, sender, message, own_cells, known, counters, cells, versions, notes, dirty, receiver):  # type: ignore[no-untyped-def]
+    """Fill in cells without evidence from tiles that a third drew scans of the source on, as `EvidenceMap.sketch_tile`.
+
+    `cells`, `versions` and `notes` are the receiver's of the source.
+    """
+    if message.source == receiver:
+        return
+    tile_columns, slots = versions.shape[1], air.tile_cells.shape[2]
+    for k in range(message.count):
+        slot = (air.nodes[world, sender].first_tile + k) % slots
+        tile, version = air.tile_keys[world, sender, slot, 0], np.uint32(air.tile_keys[world, sender, slot, 1])
+        i, j = tile // tile_columns, tile % tile_columns
+        if version < versions[i, j]:
+            continue
+        copy, filled = air.tile_cells[world, sender, slot], False
+        for row in range(TILE):
+            for column in range(TILE):
+                value, y, x = copy[row, column], i * TILE + row, j * TILE + column
+                if value != 0 and cells[y, x] == 0:
+                    cells[y, x] = value
+                    filled = True
+        if filled:
+            counters[OWN_SCAN] += claim(own_cells, known, i * TILE, TILE, j * TILE)
+            counters[PEER_SCAN] += claim(cells, known, i * TILE, TILE, j * TILE)
+            notes[tile].provisional = 1
+            dirty[i, j] = 1
 
 
 @numba.njit(cache=True, nogil=True)

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from imagine.core.raster import TILE
-from imagine.mesh_comm.information import FEW_NEWS_S, NO_NEWS_S, SCAN_NEWS_CELLS, known_cells
+from imagine.mesh_comm.information import NO_NEWS_S, known_cells
 from imagine.mesh_comm.messages import MAX_DATAGRAM
 from imagine.mesh_comm.seal import OVERHEAD
 from imagine.sim.air import (
@@ -18,6 +18,7 @@ from imagine.sim.air import (
     BYTES_SENT,
     DIGEST,
     MESSAGES_SENT,
+    MOST_DRONES,
     OWN_SCAN,
     SCAN,
     STATUS,
@@ -26,6 +27,7 @@ from imagine.sim.air import (
 )
 from imagine.sim.air_costs import (
     digest_message_bytes,
+    here_bytes,
     packed_ranges_bytes,
     packed_tile_bytes,
     packed_versions_bytes,
@@ -35,13 +37,15 @@ from imagine.sim.air_costs import (
     tiles_message_bytes,
 )
 from imagine.sim.air_plan import brings_news, plan, source_and_tile
-from imagine.sim.air_receive import is_live
+from imagine.sim.air_receive import is_live, peer_place
 from imagine.sim.air_tiles import claim, copy_tile, find_spans
 
 # these are those of mesh_comm.node, tile_exchange and digest
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4
 _DIGEST_SHARE, _MOST_DIGEST_S = 0.125, 1.5
+_STATUS_SHARE, _MOST_STATUS_S = 0.125, 2.0
+_HERE_SHARE, _MOST_HERE_S = 0.2, 1.0
 _SCANS_BEFORE_NEWS, _SCANS_BEFORE_REPEATS = 1, 4
 _EPSILON_S = 1e-6
 _MAX_PAYLOAD = MAX_DATAGRAM - OVERHEAD
@@ -126,10 +130,20 @@ def send(air, world, tick, poses, velocity, alive, ranges, clocks, layers, versi
             plan(air, world, tick, drone, live if rules.shares else 0, layers, versions)
         if now >= node.next_status - _EPSILON_S:
             said = _send_status(
-                rules, now, node, messages[drone], counters[drone], peers[drone], poses[drone], velocity[drone], live
+                rules, now, node, messages[drone], counters[drone], peers[drone], poses[drone], velocity[drone], live,
+                air.media[world, BUDGET],
             )  # fmt: skip
             if not said:
                 continue
+        period = rules.pose_period
+        if node.pending_clock == 0 and _is_near(peers[drone], poses[drone], tick, rules):
+            period = min(period, rules.near_pose_period)  # a scan that waits will tell it
+        period = max(period, min(_MOST_HERE_S, here_bytes() / (_HERE_SHARE * air.media[world, BUDGET])))
+        is_due = now >= node.pose_told_at + period - _EPSILON_S
+        if is_due and not _send_here(
+            rules, now, node, messages[drone], counters[drone], poses[drone], velocity[drone]
+        ):  # fmt: skip
+            continue
         if node.digest_units > 0 and node.digest_parts > 0:
             said = _send_digests(
                 rules, now, drone, node, messages[drone], counters[drone], air.digests[world, drone], versions[drone],
@@ -162,9 +176,9 @@ def _is_worth_telling(node, now, rules, clock, cells, versions, known, counters)
                 counters[OWN_SCAN] += claim(cells, known, i * TILE, TILE, j * TILE)
     node.claimed_clock = np.int64(clock)
     news = counters[OWN_SCAN] - node.told_cells
-    if node.pending_clock != 0 or news >= SCAN_NEWS_CELLS:
+    if node.pending_clock != 0 or news > 0:
         return True
-    return now >= node.next_scan - rules.scan_period + (FEW_NEWS_S if news > 0 else NO_NEWS_S) - _EPSILON_S
+    return now >= node.next_scan - rules.scan_period + NO_NEWS_S - _EPSILON_S
 
 
 @numba.njit(cache=True, nogil=True)
@@ -203,7 +217,7 @@ def _transmit(rules, now, node, messages, counters, kind, size):  # type: ignore
 
 
 @numba.njit(cache=True, nogil=True)
-def _send_status(rules, now, node, messages, counters, peers, pose, velocity, live):  # type: ignore[no-untyped-def]
+def _send_status(rules, now, node, messages, counters, peers, pose, velocity, live, budget):  # type: ignore[no-untyped-def]
     """Send where the drone is and whom it hears; False when bytes run short."""
     heard = 0
     for peer in range(peers.shape[0]):
@@ -215,8 +229,34 @@ def _send_status(rules, now, node, messages, counters, peers, pose, velocity, li
     if place >= 0:
         message = messages[place]
         message.x, message.y, message.yaw = pose[0], pose[1], pose[2]
-        message.vx, message.vy, message.hears = velocity[0], velocity[1], live
-    node.next_status = now + rules.status_period
+        message.vx, message.vy, message.hears, message.slot = velocity[0], velocity[1], live, 0
+    spread = min(_MOST_STATUS_S, size / (_STATUS_SHARE * budget))
+    node.next_status, node.pose_told_at = now + max(rules.status_period, spread), now
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_near(peers, pose, tick, rules):  # type: ignore[no-untyped-def]
+    """Tell whether a peer in touch is taken to be near."""
+    for peer in range(peers.shape[0]):
+        x, y, found = peer_place(peers[peer], tick, rules)
+        if found and np.hypot(x - pose[0], y - pose[1]) <= rules.near:
+            return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def _send_here(rules, now, node, messages, counters, pose, velocity):  # type: ignore[no-untyped-def]
+    """Send where the drone is; False when bytes run short."""
+    size = here_bytes()
+    if not _can_send(node, messages, size):
+        return False
+    place = _transmit(rules, now, node, messages, counters, STATUS, size)
+    if place >= 0:
+        message = messages[place]
+        message.x, message.y, message.yaw = pose[0], pose[1], pose[2]
+        message.vx, message.vy, message.slot = velocity[0], velocity[1], 1
+    node.pose_told_at = now
     return True
 
 
@@ -283,9 +323,19 @@ def _send_scan(rules, now, node, messages, counters, windows):  # type: ignore[n
         node.busy_slots |= 1 << node.pending_slot
         node.scans += 1
     node.scan_clock, node.pending_clock, node.pending_slot = node.pending_clock, 0, -1
-    node.next_scan = now + rules.scan_period
+    node.next_scan, node.pose_told_at = now + rules.scan_period, now
     node.told_cells = counters[OWN_SCAN]
     return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _tile_cost(note, cells, row, column, version, is_sketch):  # type: ignore[no-untyped-def]
+    """Return what a tile's cells cost in bytes; of a version that was noted once, as noted, but not of a sketch."""
+    if is_sketch:
+        return np.int64(packed_tile_bytes(cells, row * TILE, column * TILE))
+    if note.cost_version != version:
+        note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), version
+    return np.int64(note.cost)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -295,21 +345,20 @@ def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-u
     messages, counters = air.messages[world, drone], air.counters[world, drone]
     tile_columns, slots = versions.shape[3], air.tile_cells.shape[2]
     now = tick / air.rules.ticks_per_s
-    source, _, _ = source_and_tile(wanted[0])
-    cells = layers[drone, source] if source == drone else air.confirmed[world, drone, source]
+    head, _, _ = source_and_tile(wanted[0])
+    source, is_sketch = head % MOST_DRONES, head >= MOST_DRONES
+    cells = layers[drone, source] if source == drone or is_sketch else air.confirmed[world, drone, source]
     held, notes = versions[drone, source], air.notes[world, drone, source]
     reserved, size, count = _RESERVED_TILES, 0, 0
     for entry in range(node.wanted):
         its_source, row, column = source_and_tile(wanted[entry])
-        if its_source != source:
+        if its_source != head:
             continue
-        note = notes[row * tile_columns + column]
-        if note.cost_version != held[row, column]:
-            note.cost, note.cost_version = packed_tile_bytes(cells, row * TILE, column * TILE), held[row, column]
-        reserved += note.cost + _RESERVED_TILE
+        cost = _tile_cost(notes[row * tile_columns + column], cells, row, column, held[row, column], is_sketch)
+        reserved += cost + _RESERVED_TILE
         if reserved > _MAX_PAYLOAD or count == _MOST_TILES or node.tiles + count == slots:
             break
-        size += tile_in_message_bytes(np.int64(note.cost), np.int64(note.cost_version))
+        size += tile_in_message_bytes(cost, np.int64(held[row, column]))
         count += 1
     size += tiles_message_bytes(count)
     if count == 0 or not _can_send(node, messages, size):
@@ -318,7 +367,7 @@ def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-u
     left = taken = 0
     for entry in range(node.wanted):
         its_source, row, column = source_and_tile(wanted[entry])
-        if taken == count or its_source != source:
+        if taken == count or its_source != head:
             wanted[left] = wanted[entry]
             left += 1
             continue
@@ -328,11 +377,17 @@ def _send_tiles(air, world, tick, drone, layers, versions):  # type: ignore[no-u
             air.tile_keys[world, drone, slot, 0] = tile
             air.tile_keys[world, drone, slot, 1] = held[row, column]
             copy_tile(cells, row * TILE, column * TILE, air.tile_cells[world, drone, slot], 0, 0)
+        taken += 1
+        if is_sketch:
+            known = known_cells(cells, row * TILE, column * TILE)
+            for peer in range(layers.shape[0]):
+                if (node.readers >> peer) & 1 == 1:
+                    air.sketched[world, drone, peer, source, tile] = known
+            continue
         notes[tile].sent_version, notes[tile].sent_tick = held[row, column], tick
         notes[tile].sent_known = known_cells(layers[drone, source], row * TILE, column * TILE)
-        taken += 1
     node.wanted = left
     if place >= 0:
-        messages[place].source, messages[place].count = source, count
+        messages[place].source, messages[place].count, messages[place].slot = source, count, np.int32(is_sketch)
         node.tiles += count
     return True

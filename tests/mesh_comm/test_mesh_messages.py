@@ -37,6 +37,8 @@ SAMPLES = [
     Digest(1.0, []),
     Status(4, 1.0, HERE, (0.5, 0.0), 1.2, 0.8, "OFFBOARD", True, "policy", "", 1, 2, 3, {"scan": 9}, {0: 0.1}, 5, 6),
     Command("land", 0, 2**52, {1: 2**32 - 1, 254: 0}),
+    messages.Here(4, 1.0, HERE, (0.5, 0.0)),
+    messages.Sketch(3, [Tile(-2, 5, 0, b"cells")], 7),
 ]
 
 
@@ -95,7 +97,7 @@ def test_fields_appended_to_a_long_message_are_counted() -> None:
         (b"", "wire-version"),
         (bytes((WIRE_VERSION + 1,)) + encode(SAMPLES[0])[1:], "wire-version"),
         (bytes((WIRE_VERSION - 1,)) + encode(SAMPLES[0])[1:], "wire-version"),
-        (wire(6, "what", 2, {"nobody": ["knows"]}), "unknown-kind"),
+        (wire(8, "what", 2, {"nobody": ["knows"]}), "unknown-kind"),
         (wire(127), "unknown-kind"),
         (wire(200, 1, 2), "unknown-kind"),
         (wire(0), "unknown-kind"),

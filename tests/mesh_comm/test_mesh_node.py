@@ -138,9 +138,71 @@ def test_a_relayed_tile_is_the_confirmed_one_even_while_scans_are_drawn_over_it(
         b.node.receive(datagram, 3.1)
     assert b.evidence.layers[1].provisional.any()
     c.fly(Pose(0.0, 1.0, 0.0), 3.1)
-    exchange([b, c], ticks(3.2, 4.0))
+    exchange([b, c], ticks(3.2, 1.5))  # the source is still taken to be in reach of the relay
     assert c.evidence.versions(1) == confirmed
     assert all(np.array_equal(c.evidence.tile(1, key), cells) for key, cells in truth.items())
+
+
+def drawn_by_a_source_that_left() -> tuple[Drone, Drone, Drone]:
+    """Return a drone that left, one that heard its last scan and no tile of it, and one that was with neither."""
+    a, b, c = (make_drone(i, protocol="multi-hop") for i in (1, 2, 3))
+    b.fly(Pose(0.0, 0.0, 0.0), 0.0)
+    a.fly(Pose(-1.0, 0.0, 0.0), 0.0)
+    exchange([a, b], ticks(0.0, 3.0))
+    a.fly(Pose(4.5, 1.0, 0.4), 3.1)
+    for datagram in carrying(a.poll(3.1), messages.Scan):
+        b.node.receive(datagram, 3.1)
+    c.fly(Pose(-3.0, -1.0, 0.0), 6.0)
+    return a, b, c
+
+
+def test_what_a_source_told_before_it_left_is_passed_on_until_the_source_confirms_it() -> None:
+    a, b, c = drawn_by_a_source_that_left()
+    exchange([b, c], ticks(6.0, 4.0))
+    for key in (TileKey(column, row) for column in range(-6, 6) for row in range(-6, 6)):
+        np.testing.assert_array_equal(c.evidence.tile(1, key) != 0, b.evidence.tile(1, key) != 0)
+    assert c.evidence.versions(1) == b.evidence.versions(1)  # nothing of it is confirmed
+    assert c.evidence.layers[1].provisional.any()
+    sketches = [m for m in contents([d for _, d in b.sent]) if isinstance(m, messages.Sketch)]
+    places = [messages.tile_key(tile) for sketch in sketches for tile in sketch.tiles]
+    assert len(places) == len(set(places)) > 0  # each is told once
+    exchange([a, b, c], ticks(10.0, 4.0))
+    assert same_layers([a, b, c])
+
+
+def test_a_sketch_tells_nothing_to_who_holds_a_later_version_or_hears_the_source() -> None:
+    a = drawn_by_a_source_that_left()[0]
+    d = make_drone(4, protocol="multi-hop")
+    exchange([a, d], ticks(6.0, 2.0))
+    before = snapshot(d.evidence)
+    cells = pack_tile(np.full((32, 32), 8, np.int8))
+    held = d.evidence.versions(1)
+    key = min(held)
+    old = messages.Sketch(1, [Tile(key.column, key.row, held[key] - 1, cells)], 1)
+    same = messages.Sketch(1, [Tile(key.column, key.row, held[key], cells)], 1)
+    forger = Sealer(KEY, 9, 1)
+    d.node.receive(forger.seal(messages.encode(same), 8.0), 8.0)
+    assert snapshot(d.evidence) == before  # the source is in reach
+    d.node.receive(forger.seal(messages.encode(old), 20.0), 20.0)
+    assert snapshot(d.evidence) == before
+    d.node.receive(forger.seal(messages.encode(same), 20.0), 20.0)
+    assert snapshot(d.evidence) != before
+    assert d.evidence.versions(1) == held
+    assert d.node.stats == {}
+
+
+def test_a_drone_tells_where_it_is_more_often_while_a_peer_is_near() -> None:
+    told = {}
+    for apart in (1.0, 4.0):
+        a, b = make_drone(1), make_drone(2)
+        for now in ticks(0.0, 10.0):
+            for drone, x in ((a, 0.0), (b, apart)):
+                drone.node.set_status(Status(drone.node.id, float(now), Pose(x, 0.0, 0.0)))
+            exchange([a, b], np.array([now]))
+        poses = [m for m in contents([d for _, d in a.sent]) if isinstance(m, messages.Here | Status)]
+        told[apart] = len(poses)
+    assert told[4.0] == 20
+    assert 45 <= told[1.0] <= 50
 
 
 @pytest.mark.parametrize("protocol", ["off", "one-hop", "multi-hop"])
@@ -595,8 +657,8 @@ def test_what_newer_nodes_say_is_counted_and_hurts_nothing() -> None:
     drone = listener()
     before = snapshot(drone.evidence)
     order = messages.encode(messages.Command("land", 2, 3))
-    kind_6, version_3 = bytes((order[0],)) + b"\x92\x06\x01", b"\x03" + order[1:]
-    for payload in (kind_6, version_3, version_3):
+    kind_8, version_3 = bytes((order[0],)) + b"\x92\x08\x01", b"\x03" + order[1:]
+    for payload in (kind_8, version_3, version_3):
         drone.node.receive(_FORGER.seal(payload, 0.0), 0.0)
     assert drone.node.stats == {"unknown-kind": 1, "wire-version": 2}
     status = msgspec.msgpack.decode(messages.encode(Status(1, 0.0, Pose(0.5, 0.0, 0.0)))[1:])

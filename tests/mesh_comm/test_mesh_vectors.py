@@ -20,7 +20,7 @@ ROWS = LISTED["datagrams"]
 
 
 def test_every_kind_is_there() -> None:
-    assert {row["kind"] for row in ROWS} == {"Scan", "Tiles", "Digest", "Status", "Command"}
+    assert {row["kind"] for row in ROWS} == {"Scan", "Tiles", "Digest", "Status", "Command", "Here", "Sketch"}
     assert LISTED["wire_version"] == messages.WIRE_VERSION
 
 

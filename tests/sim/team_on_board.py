@@ -98,7 +98,7 @@ class TeamOnBoard:
         self.env, self.world, self.rules = env, world, env.air.rules
         self.drones = [OnBoard(env, world, drone) for drone in range(env.drones)]
         self.delivered = np.zeros((env.drones, env.drones), np.int64)
-        self.lost = self.relayed = 0
+        self.lost = self.relayed = self.sketched = 0
         self.said = np.zeros(4, np.int64)
         self._sealers = [Sealer(KEY, own.id, 1) for own in self.drones]
         self._in_flight: list[InFlight] = []
@@ -184,17 +184,20 @@ class TeamOnBoard:
         for place in range(int(node["messages"])):
             record = ring[(int(node["first_message"]) + place) % len(ring)]
             kind, count = int(record["kind"]), int(record["count"]) if record["kind"] == TILES else 0
-            told = [keys[(tile + k) % len(keys)].tolist() for k in range(count)]
+            told = [(tile + k) % len(keys) for k in range(count)]
             tile += count
             if record["sequence"] <= self._said_until[own.at[1]]:
                 continue
             self._said_until[own.at[1]] = record["sequence"]
             self.said[kind] += 1
-            message = self._message(own, record, told, now)
+            message = self._message(own, record, told, keys, now)
             datagram = self._sealers[own.at[1]].seal(messages.encode(message), now)
             self._in_flight.append(InFlight(float(record["arrival"]), own.at[1], int(record["sequence"]), datagram))
 
-    def _message(self, own: OnBoard, record: Any, told: list[list[int]], now: float) -> messages.Message:
+    def _message(
+        self, own: OnBoard, record: Any, told: list[int], keys: NDArray[np.int64], now: float
+    ) -> messages.Message:
+        """Return the message of a record; `told` are the slots of its tiles, whose places and versions are `keys`."""
         pose = Pose(*(float(record[name]) for name in ("x", "y", "yaw")))
         if record["kind"] == SCAN:
             scan, self._offered[own.at[1]] = self._offered[own.at[1]], None
@@ -204,15 +207,29 @@ class TeamOnBoard:
         if record["kind"] == TILES:
             source = int(record["source"]) + 1
             self.relayed += source != own.id
-            return messages.Tiles(source, [self._tile(source, place, version) for place, version in told], 1)
+            tiles = [keys[slot].tolist() for slot in told]
+            if record["slot"] == 0:
+                packed = [self._packed[source, self._key(place), version] for place, version in tiles]
+                return messages.Tiles(source, self._tiles(tiles, packed), 1)
+            self.sketched += 1
+            cells = self.env.air.state.tile_cells[own.at]
+            return messages.Sketch(source, self._tiles(tiles, [pack_tile(cells[slot]) for slot in told]), 1)
         if record["kind"] == DIGEST:  # what it tells decides only what is sent, and that is the batch's affair here
             return messages.Digest(now, [])
         assert record["kind"] == STATUS
         velocity = float(record["vx"]), float(record["vy"])
+        if record["slot"] == 1:
+            return messages.Here(own.id, now, pose, velocity)
         return messages.Status(own.id, now, pose, velocity, ladder="policy")
 
-    def _tile(self, source: int, place: int, version: int) -> messages.Tile:
+    def _tiles(self, tiles: list[list[int]], packed: list[bytes]) -> list[messages.Tile]:
+        keys = [self._key(place) for place, _ in tiles]
+        return [
+            messages.Tile(key.column, key.row, version, cells)
+            for key, (_, version), cells in zip(keys, tiles, packed, strict=True)
+        ]
+
+    def _key(self, place: int) -> TileKey:
         column, row = self.env.maps.origins[self.world] // TILE
         tile_columns = self.env.maps.versions.shape[4]
-        key = TileKey(int(column) + place % tile_columns, int(row) + place // tile_columns)
-        return messages.Tile(key.column, key.row, version, self._packed[source, key, version])
+        return TileKey(int(column) + place % tile_columns, int(row) + place // tile_columns)

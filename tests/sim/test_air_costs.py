@@ -14,6 +14,7 @@ from imagine.sim.air_costs import (
     TILE_WEIGHTS,
     VERSIONS_WEIGHTS,
     digest_message_bytes,
+    here_bytes,
     int_bytes,
     packed_ranges_bytes,
     packed_tile_bytes,
@@ -42,7 +43,9 @@ def test_framing_is_counted_to_the_byte(said: list[Said]) -> None:
         match message:
             case messages.Scan():
                 expected = scan_message_bytes(len(message.packed), message.clock)
-            case messages.Tiles():
+            case messages.Here():
+                expected = here_bytes()
+            case messages.Tiles() | messages.Sketch():
                 each = [tile_in_message_bytes(len(tile.packed), tile.version) for tile in message.tiles]
                 expected = tiles_message_bytes(len(message.tiles)) + sum(each)
             case messages.Digest():
@@ -56,7 +59,7 @@ def test_framing_is_counted_to_the_byte(said: list[Said]) -> None:
             case _:
                 pytest.fail(f"a drone said {message}")
         assert item.sealed_bytes == expected
-    assert kinds == {messages.Scan, messages.Tiles, messages.Digest, messages.Status}
+    assert kinds == {messages.Scan, messages.Tiles, messages.Digest, messages.Status, messages.Here}
 
 
 @pytest.mark.parametrize(

@@ -46,8 +46,7 @@ def bench_mesh(plan: MeshPlan, progress: Callable[[str], None]) -> Results:
     results: Results = {}
     progress("the radio comes back after a partition")
     results |= reunion(first)
-    progress("against whole maps")
-    results |= against_whole_maps(first)
+    results |= against_whole_maps(flights, progress)
     progress("handing over layers")
     results |= handover(first)
     progress("throughput")

@@ -23,13 +23,15 @@ from imagine.train.mesh_bench.team import HALF_EXTENT_M, Team
 
 _KEY = bytes(KEY_BYTES)
 _LIMIT_S = 300.0
+_STRIDE_TICKS = 5
 
 
 def crowd(flight: Flight, minutes: float, progress: Callable[[str], None]) -> Results:
-    """Let many drones explore with half of all datagrams lost and half a second of delay, then hover for `minutes`.
+    """Let many drones explore with half of all datagrams lost and half a second of delay, then fly on for `minutes`.
 
     Seconds from the last scan until every drone holds every layer; and resident memory, in the first and in the last
-    quarter of the hovering, when they tell statuses and digests and scan no more.
+    quarter of the time after that. They fly the same ways back and forth then and scan twice a second, so that maps
+    keep changing and scans, tiles and digests never end, in steps of half a second.
     """
     radio = RadioSettings(range_m=1000.0, loss=0.5, latency_s=0.5)
     team = Team(flight, MeshSettings(), radio)
@@ -50,10 +52,11 @@ def crowd(flight: Flight, minutes: float, progress: Callable[[str], None]) -> Re
         }
     }  # fmt: skip
     memory = []
+    before = dict(team.bytes_sent)
     for minute in range(round(minutes)):
-        progress(f"{flight.drones} drones hover: minute {minute} of {minutes:.0f}")
-        for _ in range(round(60.0 / TICK_S)):
-            team.tick(scans=False)
+        progress(f"{flight.drones} drones fly to and fro: minute {minute} of {minutes:.0f}")
+        for _ in range(round(60.0 / TICK_S / _STRIDE_TICKS)):
+            team.to_and_fro(_STRIDE_TICKS)
         memory.append(_resident_bytes())
     if len(memory) > 2:
         quarter = max(1, len(memory) // 4)
@@ -61,6 +64,7 @@ def crowd(flight: Flight, minutes: float, progress: Callable[[str], None]) -> Re
         results["memory_growth"] = {
             "value": round(late / early - 1.0, 5), "unit": "share of resident memory", "minutes": len(memory),
             "early_bytes": round(early), "late_bytes": round(late), "drones": flight.drones,
+            "sent_meanwhile": {kind: sent - before[kind] for kind, sent in team.bytes_sent.items()},
         }  # fmt: skip
     return results
 

@@ -49,6 +49,8 @@ class Team:
         """Let everyone start."""
         rng = np.random.default_rng([self.seed, 2])
         self.radio = RadioMedium(self.flight.drones, self.radio_settings, rng, self.flight.level.segments)
+        self.reach = np.zeros((self.flight.drones, self.flight.drones), np.bool_)
+        """Who hears whom, as of the last tick."""
         self.maps = [EvidenceMap(number, HALF_EXTENT_M) for number in range(1, self.flight.drones + 1)]
         self.nodes = [
             MeshNode(evidence, self.flight.lidar, self.flight.range_cap_m, self.mesh, Sealer(_KEY, evidence.own, BOOT))
@@ -69,19 +71,30 @@ class Team:
         """Hear, map and speak, at the poses of the flight's next tick; after its end, or without scans, they hover."""
         at = min(max(self.ticks, 0), len(self.flight.poses) - 1)
         scans = scans and 0 <= self.ticks < len(self.flight.poses)
-        self.ticks += 1
+        self._advance(1, at, 1.0 if scans else 0.0, scans)
+
+    def to_and_fro(self, stride: int) -> None:
+        """Fly the recording over and over, back and forth, and scan, `stride` ticks at a time."""
+        count = len(self.flight.poses)
+        phase = self.ticks % (2 * count)
+        self._advance(stride, min(phase, 2 * count - 1 - phase), 1.0 if phase < count else -1.0, True)
+
+    def _advance(self, stride: int, at: int, way: float, scans: bool) -> None:
+        """Let `stride` ticks go by; everyone is then where the recording is at tick `at`, `way` times as fast."""
+        self.ticks += stride
         now, poses = self.now, self.flight.poses[at]
         places = poses[:, :2]
         if not self.is_open(now):
             places = places + _APART_M * np.arange(1, len(poses) + 1)[:, None]
+        self.reach = self.radio.in_reach(places)[1:, 1:]
         for delivery in self.radio.deliver(now, places):
             if delivery.receiver != GROUND:
                 self.nodes[delivery.receiver - 1].receive(delivery.datagram, now)
         for index, node in enumerate(self.nodes):
             pose = Pose(*poses[index].tolist())
             if scans:
-                self._map(index, pose, now)
-            velocity = self.flight.velocities[at, index] if scans else (0.0, 0.0)
+                self._map(index, pose, self.flight.ranges[at, index], now)
+            velocity = way * self.flight.velocities[at, index]
             node.set_status(_status(node.id, now, pose, float(velocity[0]), float(velocity[1])))
         for node in self.nodes:
             for datagram in node.poll(now):
@@ -101,9 +114,8 @@ class Team:
             self.tick()
         return self
 
-    def _map(self, index: int, pose: Pose, now: float) -> None:
+    def _map(self, index: int, pose: Pose, ranges: NDArray[np.float32], now: float) -> None:
         node, lidar = self.nodes[index], self.flight.lidar
-        ranges = self.flight.ranges[self.ticks - 1, index]
         scan = Scan(now, mask_near(ranges, lidar, pose, node.teammates(now), self.mesh.mask_radius_m))
         self.maps[index].integrate(pose, scan, lidar, self.flight.range_cap_m)
         node.offer_scan(scan, pose, now)

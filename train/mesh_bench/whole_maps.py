@@ -55,6 +55,7 @@ class WholeMaps:
         self._medium = RadioMedium(drones, self.radio, rng, self.flight.level.segments)
         self._maps = [EvidenceMap(number, HALF_EXTENT_M) for number in range(1, drones + 1)]
         self._told = np.zeros((drones, *self._maps[0].shape), np.bool_)
+        self._ever = self._told.copy()
         self._noticed = np.zeros((drones, drones), np.bool_)
         self._met = np.zeros((drones, drones), np.bool_)
         self._scans = [[] for _ in range(drones)]
@@ -79,7 +80,8 @@ class WholeMaps:
                     self._take(receiver, sender, message)
         for drone in range(flight.drones):
             self._draw(self._maps[drone], drone, drone, tick)
-        known = self.known()
+        known = self._told | np.array([has_evidence(evidence) for evidence in self._maps])
+        self._ever |= known
         for drone in range(flight.drones):
             if in_touch[drone].any():
                 self._scans[drone].append(_Waiting(self.scan_bytes, tick))
@@ -89,9 +91,11 @@ class WholeMaps:
         self._met = in_touch
 
     def known(self) -> NDArray[np.bool_]:
-        """Tell of which cells each drone has evidence, `[drones, rows, columns]`."""
-        self._told |= np.array([has_evidence(evidence) for evidence in self._maps])
-        return self._told.copy()
+        """Tell of which cells each drone ever had evidence, `[drones, rows, columns]`.
+
+        A map that is sent tells of those alone that have evidence then: what cancels out is unknown again.
+        """
+        return self._ever.copy()
 
     def _advance(self, sender: int) -> list[_Waiting]:
         """Send for a tick; return what is complete."""
