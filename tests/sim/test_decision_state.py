@@ -132,7 +132,7 @@ def test_decisions_become_the_setpoints_that_fly_and_stand(mode: Any, axes: Axes
             actions = rng.uniform(-1.4, 1.4, (WORLDS, DRONES, action.size)).astype(np.float32)
             env.decisions.decide(actions, env.estimates)
             intents = {index: to_intent(actions[index], action, axes, pose) for index, pose in at.items()}
-        env._tick(running, observes=True)
+        env._tick(running, np.zeros_like(running), observes=True)
         for index, pose in at.items():
             vx, vy, rate = intended_velocity(intents[index], action, axes, pose)
             safe = shield_velocity(vx, vy, Scan(0.0, ranges[index]), env.lidar, limits)

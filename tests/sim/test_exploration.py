@@ -317,7 +317,7 @@ def test_actions_may_be_nested_lists() -> None:
 def test_a_smaller_budget_sends_fewer_bytes() -> None:
     sent = []
     for budget in (MeshSettings().rate_bytes_per_s, 100.0):
-        env = Exploration(settings(levels=("1",), budget_bytes_per_s=budget), seed=0)
+        env = Exploration(settings(levels=("4",), budget_bytes_per_s=budget), seed=0)
         env.reset()
         for _ in range(150):
             env.step(np.nan_to_num(env.planner_actions()))

@@ -124,13 +124,14 @@ def test_radios_reach_as_far_as_their_world_drew() -> None:
 
 
 def test_less_budget_is_less_said() -> None:
-    env = environment(EVERYTHING | {"worlds": 24, "episode_ticks": 1000, "radio": {"range_m": 50.0}})
+    short = {"budget_bytes_per_s": [100.0, 1500.0]}
+    env = environment(EVERYTHING | {"worlds": 24, "episode_ticks": 1000, "radio": {"range_m": 50.0}} | short)
     env.reset()
-    for _ in range(60):
+    for _ in range(120):
         env.step(np.nan_to_num(env.planner_actions()))
     budget, said = env.air.state.media[:, BUDGET], env.air.bytes_sent.sum(axis=-1).max(axis=1)
     burst = env.settings.mesh.burst_bytes
-    assert (said <= burst + 6.1 * budget).all()
+    assert (said <= burst + 12.1 * budget).all()
     tight = budget < np.median(budget)
     assert said[tight].mean() < said[~tight].mean()
 
