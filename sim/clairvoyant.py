@@ -44,12 +44,14 @@ class Floor:
 class Clairvoyant:
     """A level with all that can be seen from every point of a 0.2 m lattice, and the shortest ways between them.
 
-    `points` `[n, 2]` metres; `seen` uint64 `[n, words]`, which of the `cells` that count each sees; `nodes` `[waypoints]`
-    the points that plans go through, `far` and `before` `[waypoints, n]` the ways from everywhere to each of them;
+    `points` `[n, 2]` metres; `seen` uint64 `[n, words]`, which of the `cells` that count each sees; `nodes`
+    `[waypoints]` the points that plans go through, `far` and `before` `[waypoints, n]` the ways there from everywhere;
     `clear` bool `[rows, columns]`, where all cells around can be flown in.
     """
 
-    def __init__(self, level: Level, sight_m: float = SIGHT_M, every_cell: int = 1, near_factor: float = 1.0, seed: int = 0) -> None:
+    def __init__(
+        self, level: Level, sight_m: float = SIGHT_M, every_cell: int = 1, near_factor: float = 1.0, seed: int = 0
+    ) -> None:
         """Look from everywhere in `level`, as far as drones map, at every or every n-th cell along both axes.
 
         Ways beside obstacles count `near_factor` times: what is flown for real keeps to the middle of doors.

@@ -203,8 +203,8 @@ def path_through(way, length, start, nodes, before):  # type: ignore[no-untyped-
 def ahead(path, points, x, y, clear, column0, row0):  # type: ignore[no-untyped-def]
     """Return the farthest point of a path that (x, y) can fly to straight, at most `_AHEAD_M` along the path.
 
-    Straight is through `clear` cells, bool `[rows, columns]` from cell (column0, row0). Where nothing is, in a door, it is
-    the last point of the path that is only a step away.
+    Straight is through `clear` cells, bool `[rows, columns]` from cell (column0, row0). Where nothing is, in a door, it
+    is the last point of the path that is only a step away.
     """
     best, metres = -1, 0.0
     for k in range(1, len(path)):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imagine.core.errors import InputError
 from imagine.sim.action_log import ActionLog

@@ -29,7 +29,7 @@ class Pilot(Protocol):
     def act(self, env: Exploration, observation: Observation, worlds: NDArray[np.bool_] | None = None) -> Actions:
         """Return the actions, float32 `[worlds, drones, action size]` in [-1, 1]; nan where a planner has no advice.
 
-        Of other worlds than `worlds` (bool `[worlds]`, None: all) they are not used: whoever plans for long leaves them.
+        Those of other worlds than `worlds` (bool `[worlds]`, None: all) are not used: a pilot may leave them out.
         """
 
 

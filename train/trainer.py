@@ -26,8 +26,8 @@ from imagine.train.curriculum import Curriculum
 from imagine.train.evaluation import evaluate
 from imagine.train.imitation import collect_labels, label_buffer, learn
 from imagine.train.learner import Learner
-from imagine.train.policies import policy_of
 from imagine.train.pilots import Pilot
+from imagine.train.policies import policy_of
 from imagine.train.ppo import update
 from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
 from imagine.train.rollout import Recall

@@ -1,8 +1,8 @@
 """A teacher that knows the level: advises, and flies, by a plan of the team's whole flight that it mends as it goes.
 
-No drone can know what it knows. It is there to teach: a student that sees what drones see, and is told where a team that
-knew everything would fly, learns levels by heart, and what a map promises beyond its frontiers (Choudhury et al. 2018,
-"Data-driven planning via imitation learning"). Flown itself, it shows how far knowing a level would get a team.
+No drone can know what it knows. It is there to teach: a student that sees what drones see, and is told where a team
+that knew everything would fly, learns levels by heart (Choudhury et al. 2018, "Data-driven planning via imitation
+learning"). Flown itself, it shows how far knowing a level would get a team.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class ClairvoyantPilot:
     def act(self, env: Exploration, observation: Observation, worlds: NDArray[np.bool_] | None = None) -> Actions:
         """Return full speed along each drone's plan, nan where it is dead or has nothing left to do."""
         wanted = np.arange(env.worlds) if worlds is None else np.flatnonzero(worlds)
-        for world in wanted:
+        for world in wanted.tolist():
             if self._plans[world] is None:
                 self._plans[world] = self._plan(env, world)
         actions = np.full((env.worlds, env.drones, env.settings.action.size), np.nan, np.float32)
@@ -161,7 +161,8 @@ class ClairvoyantPilot:
             turn = poses[drone, 2] if env.settings.observation.axes == "heading" else 0.0
             chosen = None if frontiers is None else _first_by(frontiers[drone], known.points[path], poses[drone], turn)
             if chosen is None:
-                at = ahead(path, known.points, *poses[drone, :2], known.clear, column0, row0)
+                x, y, _ = poses[drone]
+                at = ahead(path, known.points, x, y, known.clear, column0, row0)
                 directions[drone] = known.points[at] - poses[drone, :2]
             else:
                 directions[drone] = _turned(chosen, turn)
@@ -172,12 +173,10 @@ def _points(known: Clairvoyant, poses: NDArray[np.float64]) -> NDArray[np.int64]
     return np.array([known.nearest(x, y) for x, y in poses[:, :2]])
 
 
-def _turned(vectors: NDArray[np.floating], angle: float) -> NDArray[np.floating]:
+def _turned(vectors: NDArray[np.floating], angle: float) -> NDArray[np.float64]:
     """Return vectors `[..., 2]` turned by an angle."""
-    if angle == 0.0:
-        return vectors
     cosine, sine = math.cos(angle), math.sin(angle)
-    return vectors @ np.array([[cosine, sine], [-sine, cosine]])
+    return np.asarray(vectors @ np.array([[cosine, sine], [-sine, cosine]]), np.float64)
 
 
 def _first_by(
@@ -187,15 +186,20 @@ def _first_by(
 
     `frontiers` `[n, numbers]` as they are shown to the drone at `pose`, along axes turned by `turn`.
     """
-    shown = frontiers[frontiers[:, 0] > 0.5]
+    shown: NDArray[np.float32] = frontiers[frontiers[:, 0] > 0.5]
     if not len(shown):
         return None
     places = pose[:2] + _turned(shown[:, OFFSETS : OFFSETS + 2] * OFFSET_M, turn)
     apart = np.hypot(path[:, None, 0] - places[:, 0], path[:, None, 1] - places[:, 1])
     near = apart < _BY_M
     if near.any():
-        return shown[np.where(near.any(axis=0), near.argmax(axis=0), len(path)).argmin(), 1:3]
-    return shown[apart.min(axis=0).argmin(), 1:3] if apart.min() < _NEAR_BY_M else None
+        first = np.where(near.any(axis=0), near.argmax(axis=0), len(path)).argmin()
+    elif apart.min() < _NEAR_BY_M:
+        first = apart.min(axis=0).argmin()
+    else:
+        return None
+    direction: NDArray[np.float32] = shown[first, 1:3]
+    return direction
 
 
 @numba.njit(cache=True, nogil=True)

@@ -10,7 +10,7 @@ from imagine.train.pilots import Actions, Pilot
 
 
 class LaunchPointPilot:
-    """Flies worlds by `anywhere`, but those that began at the launch point of their level as it is by `at_launch_point`."""
+    """Flies worlds that began at their level's launch point, as it is, by one pilot, and all others by the other."""
 
     def __init__(self, anywhere: Pilot, at_launch_point: Pilot) -> None:
         """Make a pilot that has yet to begin."""

@@ -1,0 +1,73 @@
+"""The teacher that knows the level: quicker than who does not, wherever drones are, and only where it is asked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imagine.sim.exploration import Exploration
+from imagine.sim.exploration_settings import ExplorationSettings
+from imagine.train.baselines import baseline
+from imagine.train.baselines.launch_points import LaunchPointPilot
+from imagine.train.pilots import Pilot
+
+
+def worlds(level: str, number: int, **changes: Any) -> Exploration:
+    settings = {"action": {"decision_ticks": 4}, "stop_coverage": 0.91, "random_launch": False} | changes
+    return Exploration(ExplorationSettings(levels=(level,), worlds=number, drones=3, **settings), seed=3, restart=False)
+
+
+def flown(env: Exploration, pilot: Pilot) -> list[float]:
+    observation = env.reset()
+    pilot.begin(env)
+    episodes = []
+    for _ in range(250):
+        step = env.step(np.nan_to_num(pilot.act(env, observation)))
+        observation = step.observation
+        episodes += step.episodes
+        if step.done.all():
+            break
+    assert sum(episode.contacts for episode in episodes) == 0
+    return [1000.0 if episode.t90 is None else episode.t90 for episode in episodes]
+
+
+@pytest.mark.parametrize(
+    "observation", [{}, {"frontiers": 8}, {"frontiers": 8, "axes": "heading"}], ids=["ways", "frontiers", "heading"]
+)
+def test_who_knows_level_2_is_done_long_before_who_does_not(observation: dict[str, Any]) -> None:
+    known = flown(worlds("2", 4, random_launch=True, observation=observation), baseline("clairvoyant", 0))
+    unknown = flown(worlds("2", 4, random_launch=True, action={}), baseline("coordinated", 0))
+    assert np.mean(known) < 0.9 * np.mean(unknown)
+
+
+def test_its_plans_from_a_launch_point_are_the_same_again() -> None:
+    times = [flown(worlds("4", 2), baseline("clairvoyant", 0)) for _ in range(2)]
+    assert times[0] == times[1]
+    assert max(times[0]) < 195  # coordinated takes 197
+
+
+def test_it_teaches_the_launch_points_and_the_planner_all_else() -> None:
+    env = worlds("4", 12, random_launch=True, mirror=True, as_designed=0.5, observation={"frontiers": 8})
+    observation = env.reset()
+    designed = env.as_designed
+    assert 2 < designed.sum() < 10
+    pilots = [baseline("coordinated", 0), baseline("clairvoyant", 0)]
+    both = LaunchPointPilot(baseline("coordinated", 0), baseline("clairvoyant", 0))
+    for pilot in (*pilots, both):
+        pilot.begin(env)
+    planned, known, mixed = (pilot.act(env, observation) for pilot in (*pilots, both))
+    np.testing.assert_array_equal(mixed[designed], known[designed])
+    np.testing.assert_array_equal(mixed[~designed], planned[~designed])
+    assert not np.array_equal(known[designed], planned[designed])
+
+
+def test_of_worlds_that_nobody_asks_for_it_says_nothing() -> None:
+    env, pilot = worlds("2", 3), baseline("clairvoyant", 0)
+    observation = env.reset()
+    pilot.begin(env)
+    asked = np.array([False, True, False])
+    actions = pilot.act(env, observation, asked)
+    assert np.isfinite(actions[asked]).any()
+    assert np.isnan(actions[~asked]).all()
