@@ -7,7 +7,7 @@ import pickle
 import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -20,7 +20,8 @@ from imagine.train.networks import Actor, steers
 from imagine.train.settings import TrainSettings
 
 FORMAT = "imagine-checkpoint-1"
-Phase = Literal["imitation", "ppo"]
+Phase = Literal["imitation", "ppo", "rehearsal"]
+PHASES: tuple[Phase, ...] = get_args(Phase)
 
 
 @dataclass

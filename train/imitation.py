@@ -29,17 +29,9 @@ _ALONG = 0.7  # cosine from which on a label points at a frontier
 Teacher = Literal["frontier", "coordinated", "hungarian", "clairvoyant"]
 
 
-class ImitationSettings(Settings):
-    """How long and how the planner is imitated."""
+class LabelSettings(Settings):
+    """How labels are gathered and learned from."""
 
-    teacher: Teacher = Field(
-        default="coordinated", description="the planner whose advice labels the states that are visited"
-    )
-    launch_point_teacher: Teacher | None = Field(
-        default=None, description="who labels what began at the launch point of a level as it is; none: the teacher"
-    )
-    student_draws: bool = Field(default=True, description="the student flies what it draws, not what it holds for best")
-    agent_steps: int = Field(default=250_000, ge=0, description="labelled decisions; 0 leaves imitation out")
     round_steps: int = Field(default=32, ge=1, description="steps of every world between two rounds of learning")
     gradient_steps: int = Field(default=24, ge=1, description="steps of Adam a round")
     minibatch: int = Field(default=512, ge=1)
@@ -47,9 +39,19 @@ class ImitationSettings(Settings):
     final_lr_share: float = Field(default=0.1, gt=0.0, le=1.0, description="the rate falls to this share, linearly")
     buffer_samples: int = Field(default=100_000, ge=1, description="newest labels kept; about 8.5 kB each")
     planner_share: float = Field(default=0.8, ge=0.0, le=1.0, description="drones the planner flies in round one")
-    planner_share_until: float = Field(default=0.5, ge=0.0, le=1.0, description="share of imitation when it reaches 0")
+    planner_share_until: float = Field(default=0.5, ge=0.0, le=1.0, description="share of the labels when it reaches 0")
+    student_draws: bool = Field(default=True, description="the student flies what it draws, not its best")
     precision: Precision = Field(default="auto", description="of layers, while flying and learning")
     cosine_weight: float = Field(default=0.25, ge=0.0, description="of the direction's error, beside the square error")
+
+
+class ImitationSettings(LabelSettings):
+    """How long and how a planner is imitated."""
+
+    teacher: Teacher = Field(
+        default="coordinated", description="the planner whose advice labels the states that are visited"
+    )
+    agent_steps: int = Field(default=250_000, ge=0, description="labelled decisions; 0 leaves imitation out")
 
 
 def label_buffer(actor: Actor, samples: int) -> LabelBuffer | RoundBuffer:
@@ -142,7 +144,7 @@ def learn(
     actor: Actor,
     optimiser: torch.optim.Optimizer,
     buffer: LabelBuffer | RoundBuffer,
-    settings: ImitationSettings,
+    settings: LabelSettings,
     generator: torch.Generator,
 ) -> float:
     """Take a round's gradient steps toward the labels; return the mean loss, nan where there is no label yet.

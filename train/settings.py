@@ -14,6 +14,7 @@ from imagine.train.curriculum_settings import CurriculumSettings
 from imagine.train.imitation import ImitationSettings
 from imagine.train.networks import DeviceName, NetworkSettings, steers
 from imagine.train.ppo_settings import PpoSettings
+from imagine.train.rehearsal import RehearsalSettings
 from imagine.train.tracking.settings import TrackingSettings
 
 CONFIGS = Path(__file__).parent / "configs"
@@ -35,7 +36,7 @@ class RunSettings(Settings):
 
 
 class TrainSettings(Settings):
-    """A training run: environment, curriculum, networks, imitation, PPO, tracking."""
+    """A training run: environment, curriculum, networks, imitation, PPO, rehearsal, tracking."""
 
     run: RunSettings = Field(default_factory=RunSettings)
     env: ExplorationSettings = Field(default_factory=ExplorationSettings)
@@ -43,6 +44,7 @@ class TrainSettings(Settings):
     network: NetworkSettings = Field(default_factory=NetworkSettings)
     imitation: ImitationSettings = Field(default_factory=ImitationSettings)
     ppo: PpoSettings = Field(default_factory=PpoSettings)
+    rehearsal: RehearsalSettings = Field(default_factory=RehearsalSettings)
     tracking: TrackingSettings = Field(default_factory=TrackingSettings)
 
     @model_validator(mode="after")

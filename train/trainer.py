@@ -1,7 +1,8 @@
-"""A training run from start to end: imitation of the frontier planner, then PPO, saved as it goes."""
+"""A training run from start to end: imitation of a planner, PPO, and rehearsal, saved as it goes."""
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import os
@@ -16,19 +17,19 @@ from typing import Any
 import torch
 
 from imagine.core.errors import InputError, WorkError
-from imagine.sim.exploration import Exploration
+from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.generator import PREFIX
 from imagine.train.atomic_file import write_atomically
 from imagine.train.baselines import baseline
-from imagine.train.baselines.launch_points import LaunchPointPilot
-from imagine.train.checkpoint import Checkpoint, Phase, check_same_network, load_checkpoint
+from imagine.train.checkpoint import PHASES, Checkpoint, Phase, check_same_network, load_checkpoint
 from imagine.train.curriculum import Curriculum
 from imagine.train.evaluation import evaluate
-from imagine.train.imitation import collect_labels, label_buffer, learn
+from imagine.train.imitation import LabelSettings, collect_labels, label_buffer, learn
 from imagine.train.learner import Learner
 from imagine.train.pilots import Pilot
-from imagine.train.policies import policy_of
+from imagine.train.policies import PolicyPilot, policy_of
 from imagine.train.ppo import update
+from imagine.train.rehearsal import RehearsalPilot
 from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
 from imagine.train.rollout import Recall
 from imagine.train.rollout_source import OwnRollouts, RolloutSource
@@ -55,6 +56,9 @@ class RunResult:
     agent_steps: int
     finished: bool
     levels: dict[str, dict[str, float]]
+
+
+_REHEARSAL_SEED = 7_000_003  # other worlds than PPO's
 
 
 def train(
@@ -107,7 +111,7 @@ class Trainer:
 
     settings: TrainSettings
     resumed: Checkpoint | None = None
-    agent_steps: dict[str, int] = field(default_factory=lambda: {"imitation": 0, "ppo": 0})
+    agent_steps: dict[str, int] = field(default_factory=lambda: dict.fromkeys(PHASES, 0))
     updates: int = 0
     phase: Phase = "imitation"
 
@@ -128,8 +132,15 @@ class Trainer:
         if self.resumed is not None:
             check_same_network(self.resumed, self.settings, "checkpoint")
             self.learner.restore(self.resumed)
-            self.agent_steps = dict(self.resumed.agent_steps)
+            self.agent_steps |= self.resumed.agent_steps
             self.updates, self.phase = self.resumed.updates, self.resumed.phase
+            if self.phase == "rehearsal" and self.agent_steps["ppo"] < self.settings.ppo.agent_steps:
+                if self.agent_steps["rehearsal"]:
+                    raise InputError(
+                        "ppo.agent_steps: this checkpoint has been rehearsed; for more PPO, and rehearsal after it, "
+                        "resume from checkpoints/improved.pt"
+                    )
+                self.phase = "ppo"
             self._wall_before_s = self.resumed.wall_s
             self.episodes.load_state_dict(self.resumed.progress["episodes"])
 
@@ -146,11 +157,11 @@ class Trainer:
             self._recall = Recall.restored(state["recall"], self.learner.actor)
 
     def run(self, folder: RunFolder, report: Reporter, stop: threading.Event) -> RunResult:
-        """Train until both phases are done or `stop` is set; leave a checkpoint either way.
+        """Train until all phases are done or `stop` is set; leave a checkpoint either way.
 
         But for a stop in the first phase: it takes minutes, its labels are many times the size of a checkpoint, and a
-        run that is resumed there begins anew, and so comes to the same. Raises WorkError where training diverges,
-        naming the last good checkpoint.
+        run that is resumed there begins anew, and so comes to the same; likewise in the last phase. Raises WorkError
+        where training diverges, naming the last good checkpoint.
         """
         self._folder, self._report, self._stop = folder, report, stop
         self._began = self._saved = time.monotonic()
@@ -160,6 +171,8 @@ class Trainer:
                 self._imitate()
             if self.phase == "ppo":
                 self._improve()
+            if self.phase == "rehearsal":
+                self._rehearse()
         except WorkError as error:
             where = f"; the last good checkpoint is {latest}" if latest.exists() else ""
             raise WorkError(f"{error}{where}") from error
@@ -176,39 +189,64 @@ class Trainer:
 
     def _imitate(self) -> None:
         """Let the student fly and learn from the planner's labels, round after round."""
-        settings, learner = self.settings.imitation, self.learner
-        buffer = label_buffer(learner.actor, settings.buffer_samples)
-        teacher = self._teacher()
-        teacher.begin(self.env)
-        while self.agent_steps["imitation"] < settings.agent_steps and not self._stop.is_set():
-            done_share = self.agent_steps["imitation"] / settings.agent_steps
-            began = time.monotonic()
-            until = max(settings.planner_share_until, 1e-9)
-            planner_share = settings.planner_share * max(0.0, 1.0 - done_share / until)
-            self._observation, episodes, labels = collect_labels(
-                self.env, self._observation, learner.actor, teacher, buffer, settings.round_steps, planner_share,
-                learner.rng, learner.generator, settings.precision, self._recall, settings.student_draws,
-            )  # fmt: skip
-            collected = time.monotonic()
-            for group in learner.imitation.param_groups:
-                group["lr"] = settings.lr * (1.0 - (1.0 - settings.final_lr_share) * done_share)
-            loss = learn(learner.actor, learner.imitation, buffer, settings, learner.generator)
-            steps = settings.round_steps * self.env.worlds * self.env.drones
-            numbers = {"loss": loss, "planner_share": planner_share, "labelled_share": labels / steps}
-            seconds = {"collect": collected - began, "learn": time.monotonic() - collected}
-            self._after_update(steps, settings.agent_steps, numbers, seconds, episodes)
+        settings = self.settings.imitation
+        teacher = baseline(settings.teacher, self.settings.run.seed)
+        self._observation = self._learn_labels(
+            self.env, self._observation, self._recall, teacher, settings, settings.agent_steps
+        )
         if not self._stop.is_set():
             self.phase, self.updates = "ppo", 0
             if not self.settings.run.rollout_workers:
                 self._source = self._own_rollouts()
             self._folder.save(self.checkpoint(), "imitated")
 
-    def _teacher(self) -> Pilot:
-        settings, seed = self.settings.imitation, self.settings.run.seed
-        teacher = baseline(settings.teacher, seed)
-        if settings.launch_point_teacher is None:
-            return teacher
-        return LaunchPointPilot(teacher, baseline(settings.launch_point_teacher, seed))
+    def _rehearse(self) -> None:
+        """Let the policy learn levels by heart from their launch points, and itself elsewhere, in worlds of its own."""
+        settings, run, learner = self.settings.rehearsal, self.settings.run, self.learner
+        if self.agent_steps["rehearsal"] >= settings.agent_steps:
+            return
+        environment = self.curriculum.environment.model_copy(update={"stop_coverage": settings.stop_coverage})
+        env = Exploration(environment, run.seed + _REHEARSAL_SEED)
+        env.set_level_weights(self.curriculum.level_weights())
+        teacher = RehearsalPilot(
+            PolicyPilot(policy_of(copy.deepcopy(learner.actor), run.name, environment)),
+            baseline(settings.launch_point_teacher, run.seed), baseline(settings.late_teacher, run.seed),
+            settings.late_coverage,
+        )  # fmt: skip
+        for group in learner.imitation.param_groups:
+            group["lr"] = settings.lr
+        learner.imitation.state.clear()
+        recall = Recall.nothing(learner.actor, env.worlds * env.drones)
+        self._learn_labels(env, env.reset(), recall, teacher, settings, settings.agent_steps)
+        self._source = None
+        self._last = None if self._stop.is_set() else self.checkpoint()
+
+    def _learn_labels(
+        self, env: Exploration, observation: Observation, recall: Recall, teacher: Pilot, settings: LabelSettings,
+        agent_steps: int,
+    ) -> Observation:  # fmt: skip
+        """Gather labels and learn from them, round after round, until there are so many; return what is seen then."""
+        learner, phase = self.learner, self.phase
+        buffer = label_buffer(learner.actor, settings.buffer_samples)
+        teacher.begin(env)
+        while self.agent_steps[phase] < agent_steps and not self._stop.is_set():
+            done_share = self.agent_steps[phase] / agent_steps
+            began = time.monotonic()
+            until = max(settings.planner_share_until, 1e-9)
+            planner_share = settings.planner_share * max(0.0, 1.0 - done_share / until)
+            observation, episodes, labels = collect_labels(
+                env, observation, learner.actor, teacher, buffer, settings.round_steps, planner_share, learner.rng,
+                learner.generator, settings.precision, recall, settings.student_draws,
+            )  # fmt: skip
+            collected = time.monotonic()
+            for group in learner.imitation.param_groups:
+                group["lr"] = settings.lr * (1.0 - (1.0 - settings.final_lr_share) * done_share)
+            loss = learn(learner.actor, learner.imitation, buffer, settings, learner.generator)
+            steps = settings.round_steps * env.worlds * env.drones
+            numbers = {"loss": loss, "planner_share": planner_share, "labelled_share": labels / steps}
+            seconds = {"collect": collected - began, "learn": time.monotonic() - collected}
+            self._after_update(steps, agent_steps, numbers, seconds, episodes)
+        return observation
 
     def _own_rollouts(self) -> OwnRollouts:
         return OwnRollouts(self.env, self._observation, self._recall, self.settings.ppo)
@@ -250,7 +288,11 @@ class Trainer:
                     "update": time.monotonic() - collected,
                 }
                 self._after_update(rollout.agent_steps, settings.agent_steps, numbers, seconds, rollout.episodes)
+            if not self._stop.is_set() and self.settings.rehearsal.agent_steps:
+                self.phase, self.updates = "rehearsal", 0
             self._last = self.checkpoint()  # while its workers live
+        if self.phase == "rehearsal":
+            self._folder.save(self._last, "improved")
 
     def _after_update(
         self, steps: int, total: int, numbers: dict[str, float], seconds: dict[str, float], episodes: list[Any]

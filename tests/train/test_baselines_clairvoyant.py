@@ -10,8 +10,8 @@ import pytest
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.baselines import baseline
-from imagine.train.baselines.launch_points import LaunchPointPilot
 from imagine.train.pilots import Pilot
+from imagine.train.rehearsal import RehearsalPilot
 
 
 def worlds(level: str, number: int, **changes: Any) -> Exploration:
@@ -48,19 +48,25 @@ def test_its_plans_from_a_launch_point_are_the_same_again() -> None:
     assert max(times[0]) < 195  # coordinated takes 197
 
 
-def test_it_teaches_the_launch_points_and_the_planner_all_else() -> None:
+def test_in_rehearsal_each_world_has_the_teacher_for_where_it_began_and_how_far_it_is() -> None:
     env = worlds("4", 12, random_launch=True, mirror=True, as_designed=0.5, observation={"frontiers": 8})
     observation = env.reset()
     designed = env.as_designed
     assert 2 < designed.sum() < 10
-    pilots = [baseline("coordinated", 0), baseline("clairvoyant", 0)]
-    both = LaunchPointPilot(baseline("coordinated", 0), baseline("clairvoyant", 0))
-    for pilot in (*pilots, both):
+    names = ("frontier", "clairvoyant", "coordinated")
+    alone = [baseline(name, 0) for name in names]
+    threshold = float(np.median(env.maps.coverage()))
+    both = RehearsalPilot(*(baseline(name, 0) for name in names), late_coverage=threshold)
+    for pilot in (*alone, both):
         pilot.begin(env)
-    planned, known, mixed = (pilot.act(env, observation) for pilot in (*pilots, both))
-    np.testing.assert_array_equal(mixed[designed], known[designed])
-    np.testing.assert_array_equal(mixed[~designed], planned[~designed])
-    assert not np.array_equal(known[designed], planned[designed])
+    policy, known, planned = (pilot.act(env, observation) for pilot in alone)
+    mixed = both.act(env, observation)
+    late = env.maps.coverage() >= threshold
+    np.testing.assert_array_equal(mixed[late], planned[late])
+    np.testing.assert_array_equal(mixed[designed & ~late], known[designed & ~late])
+    np.testing.assert_array_equal(mixed[~designed & ~late], policy[~designed & ~late])
+    assert (designed & ~late).any()
+    assert (~designed & ~late).any()
 
 
 def test_of_worlds_that_nobody_asks_for_it_says_nothing() -> None:

@@ -135,6 +135,49 @@ def test_a_longer_run_is_asked_for_at_resume(finished, tmp_path):
     assert result.agent_steps == 256 + 640
 
 
+REHEARSED = ("rehearsal.agent_steps=384", "rehearsal.round_steps=32", "rehearsal.gradient_steps=2")
+
+
+@pytest.fixture(scope="module")
+def rehearsed(tmp_path_factory):
+    return train(Path("smoke"), overrides(tmp_path_factory.mktemp("rehearsed"), *REHEARSED))
+
+
+def test_rehearsal_follows_ppo_and_changes_the_policy_alone(rehearsed):
+    rows = [json.loads(line) for line in (rehearsed.folder / "metrics.jsonl").read_text().splitlines()]
+    assert rows[-1]["agent_steps"] == 256 + 512 + 384
+    assert sum("rehearsal/loss" in row for row in rows) == 3
+    before, after = (load_checkpoint(rehearsed.folder / "checkpoints" / name) for name in ("improved.pt", "final.pt"))
+    assert not torch.equal(before.actor["mean.weight"], after.actor["mean.weight"])
+    assert all(torch.equal(value, after.critic[name]) for name, value in before.critic.items())
+
+
+def test_a_run_stopped_while_it_rehearses_rehearses_anew_and_comes_to_the_same(rehearsed, tmp_path):
+    def terminate(report):
+        if report.phase == "rehearsal":
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    stopped = train(Path("smoke"), overrides(tmp_path, *REHEARSED), report=terminate)
+    assert not stopped.finished
+    resumed = train(None, resume=stopped.folder)
+    assert resumed.finished
+    one, two = load_checkpoint(rehearsed.folder), load_checkpoint(resumed.folder)
+    assert all(torch.equal(value, two.actor[name]) for name, value in one.actor.items())
+    assert curve(resumed.folder) == curve(rehearsed.folder)
+
+
+def test_a_rehearsed_run_that_is_to_be_longer_goes_back_to_ppo_and_rehearses_again(rehearsed, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(rehearsed.folder, copy)
+    phases = []
+    with pytest.raises(InputError, match=r"improved\.pt"):
+        train(None, ("ppo.agent_steps=640",), resume=copy)
+    improved = copy / "checkpoints" / "improved.pt"
+    longer = train(None, ("ppo.agent_steps=640",), resume=improved, report=lambda report: phases.append(report.phase))
+    assert phases == ["ppo"] + ["rehearsal"] * 3
+    assert longer.agent_steps == 256 + 640 + 384
+
+
 def test_a_run_is_never_overwritten(finished, tmp_path):
     with pytest.raises(InputError, match=r"there is a run of this name; resume it"):
         train(Path("smoke"), overrides(finished[0].folder.parent))

@@ -1,0 +1,63 @@
+"""Rehearsal: after PPO a policy learns to fly known levels by heart, and everything else as it did.
+
+PPO keeps a plan of a whole flight no better than it finds one: its chance blurs what has to be done exactly. So the
+last lessons are labels again. From a level's own launch point `clairvoyant` gives them, which plans by the true level;
+anywhere else the policy itself, as it came from PPO; and where nearly all is seen a planner, which leaves no corner
+out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from imagine.sim.exploration import Exploration, Observation
+from imagine.train.imitation import LabelSettings, Teacher
+from imagine.train.pilots import Actions, Pilot
+
+
+class RehearsalSettings(LabelSettings):
+    """How long and by whom a policy is taught after PPO."""
+
+    agent_steps: int = Field(default=0, ge=0, description="labelled decisions; 0 leaves rehearsal out")
+    launch_point_teacher: Teacher = Field(
+        default="clairvoyant", description="who labels what began at the launch point of a level as it is"
+    )
+    late_teacher: Teacher = Field(default="coordinated", description="who labels worlds that are nearly explored")
+    late_coverage: float = Field(default=0.92, gt=0.0, le=1.0, description="share seen from which on it does")
+    stop_coverage: float = Field(default=0.985, gt=0.0, le=1.0, description="share seen that ends an episode")
+    student_draws: bool = Field(default=False, description="the student flies what it draws, not its best")
+    planner_share: float = Field(default=0.5, ge=0.0, le=1.0, description="drones the teachers fly in round one")
+
+
+class RehearsalPilot:
+    """Advises each world by one of three pilots, as `RehearsalSettings` tells."""
+
+    name = "rehearsal"
+
+    def __init__(self, policy: Pilot, at_launch_point: Pilot, late: Pilot, late_coverage: float) -> None:
+        """Make a pilot that has yet to begin."""
+        self._pilots = policy, at_launch_point, late
+        self._late_coverage = late_coverage
+
+    def begin(self, env: Exploration) -> None:
+        """Let all begin."""
+        for pilot in self._pilots:
+            pilot.begin(env)
+
+    def forget(self, worlds: NDArray[np.bool_]) -> None:
+        """Let all forget these worlds."""
+        for pilot in self._pilots:
+            pilot.forget(worlds)
+
+    def act(self, env: Exploration, observation: Observation, worlds: NDArray[np.bool_] | None = None) -> Actions:
+        """Return the actions of the pilot whose world it is, `[worlds, drones, action size]`; nan where it has none."""
+        late = env.maps.coverage() >= self._late_coverage
+        designed = env.as_designed & ~late
+        wanted = np.ones(env.worlds, np.bool_) if worlds is None else worlds
+        actions = np.full((env.worlds, env.drones, env.settings.action.size), np.nan, np.float32)
+        for pilot, its in zip(self._pilots, (~late & ~designed, designed, late), strict=True):
+            if (its & wanted).any():
+                actions[its] = pilot.act(env, observation, its & wanted)[its]
+        return actions
