@@ -151,7 +151,8 @@ def bootstrap_interval(
 
     `sizes` are those of the levels that the values belong to, one after another (None: a single one). The mean is then
     `level_mean`, and each level is resampled for itself (Davison and Hinkley 1997, section 3.2): what differs between
-    levels is no matter of chance, for they were chosen.
+    levels is no matter of chance, for they were chosen. With one episode a level, as of many floor plans, the levels are
+    the sample, and are resampled.
     """
     return _interval(sizes or [len(values)], lambda drawn: values[drawn].mean(axis=1), lambda mean: mean, rng)
 
@@ -180,6 +181,8 @@ def _interval(
     `level_means` takes drawn numbers of a level's values, `[resamples, size]`, and returns means `[..., resamples]`;
     `statistic` makes `[resamples]` of their mean over levels.
     """
+    if max(sizes) == 1:
+        sizes = [len(sizes)]
     parts = -(-_RESAMPLES * sum(sizes) // _PART)
     firsts = np.cumsum([0, *sizes[:-1]])
     told = []
