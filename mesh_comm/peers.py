@@ -40,6 +40,7 @@ class PeerRecord:
     pose_at: float = -math.inf
     velocity: tuple[float, float] = (0.0, 0.0)
     status: Status | None = None
+    status_stamp: float = -math.inf
     digest_at: float = -math.inf
     digest_stamp: float = -math.inf
     holdings: dict[int, Held] = field(default_factory=dict)
@@ -49,7 +50,7 @@ class PeerRecord:
     def restart(self, boot: int) -> None:
         """Forget what ended with the peer's restart: its clock begins anew and its map is empty."""
         self.boot = boot
-        self.pose_stamp = self.digest_stamp = self.digest_at = -math.inf
+        self.pose_stamp = self.status_stamp = self.digest_stamp = self.digest_at = -math.inf
         self.holdings, self.met = {}, None
 
     def note_pose(self, pose: Pose, stamp: float, now: float) -> None:
@@ -59,8 +60,8 @@ class PeerRecord:
 
     def note_status(self, status: Status, now: float) -> None:
         """Take a status unless a newer one is known."""
-        if self.status is None or status.stamp >= self.status.stamp or self.pose_stamp == -math.inf:
-            self.status, self.velocity = status, status.velocity
+        if status.stamp >= self.status_stamp:
+            self.status, self.status_stamp, self.velocity = status, status.stamp, status.velocity
         self.note_pose(status.pose, status.stamp, now)
 
     def note_here(self, here: Here, now: float) -> None:
@@ -110,8 +111,10 @@ class PeerRecord:
         return known.versions.get(key, 0) if known.boot == boot else math.inf
 
     def hears(self, other: int, within_s: float) -> bool:
-        """Tell whether the peer, by its last status, heard node `other` within the last seconds."""
-        return self.status is not None and self.status.links.get(other, math.inf) <= within_s
+        """Tell whether the peer, by the last status of its present start, heard node `other` within the last seconds."""
+        if self.status is None or self.status_stamp == -math.inf:
+            return False
+        return self.status.links.get(other, math.inf) <= within_s
 
     def position(self, now: float) -> tuple[float, float] | None:
         """Return where the peer should be now, by its last pose and velocity; None if never told."""

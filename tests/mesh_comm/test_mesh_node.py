@@ -545,6 +545,22 @@ def test_a_restarted_drone_is_heard_again_and_its_map_replaces_the_old_one() -> 
     assert b.node.stats["old-boot"] == len(a.sent)
 
 
+def test_a_restarted_drones_status_counts_although_its_clock_began_anew_and_a_pose_came_first() -> None:
+    listening = make_drone(1)
+    here = Pose(0.0, 0.0, 0.0)
+    said = [
+        (1, Status(2, 300.0, here, battery=0.2, links={3: 0.1})),
+        (2, messages.Here(2, 1.0, here, (0.0, 0.0))),
+        (2, Status(2, 1.5, here, battery=0.9)),
+    ]
+    for boot, message in said:
+        sealer = Sealer(KEY, 2, boot, first_counter=1 + len(type(message).__name__))
+        listening.node.receive(sealer.seal(messages.encode(message), 0.0), 0.0)
+    status = listening.node.peers(0.0)[2].status
+    assert status is not None
+    assert status.battery == 0.9
+
+
 def listener() -> Drone:
     drone = make_drone(2, protocol="multi-hop", max_sources=3)
     drone.fly(Pose(0.0, 0.0, 0.0), 0.0)
