@@ -553,8 +553,8 @@ def test_a_restarted_drones_status_counts_although_its_clock_began_anew_and_a_po
         (2, messages.Here(2, 1.0, here, (0.0, 0.0))),
         (2, Status(2, 1.5, here, battery=0.9)),
     ]
-    for boot, message in said:
-        sealer = Sealer(KEY, 2, boot, first_counter=1 + len(type(message).__name__))
+    for counter, (boot, message) in enumerate(said, start=1):
+        sealer = Sealer(KEY, 2, boot, first_counter=counter)
         listening.node.receive(sealer.seal(messages.encode(message), 0.0), 0.0)
     status = listening.node.peers(0.0)[2].status
     assert status is not None
