@@ -60,6 +60,7 @@ class Hearing:
         peer = state.peers.hear(opened, now)
         if peer.met is None:
             peer.met = state.evidence.versions(state.id)
+            state.exchange.note_met(sender)
         if sender in state.evidence.layers:  # what an earlier start saw, from where it was, counts no more
             state.maps.renew(sender, opened.boot)
         match message:

@@ -111,7 +111,7 @@ class PeerRecord:
         return known.versions.get(key, 0) if known.boot == boot else math.inf
 
     def hears(self, other: int, within_s: float) -> bool:
-        """Tell whether the peer, by the last status of its present start, heard node `other` within the last seconds."""
+        """Tell whether the peer, by the last status of its present start, heard node `other` lately."""
         if self.status is None or self.status_stamp == -math.inf:
             return False
         return self.status.links.get(other, math.inf) <= within_s

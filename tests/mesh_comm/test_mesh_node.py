@@ -170,6 +170,17 @@ def test_what_a_source_told_before_it_left_is_passed_on_until_the_source_confirm
     assert same_layers([a, b, c])
 
 
+def test_a_drone_that_restarts_within_a_moment_is_told_again_what_is_left_of_a_source() -> None:
+    _, b, c = drawn_by_a_source_that_left()
+    exchange([b, c], ticks(6.0, 4.0))
+    again = make_drone(3, boot=2, protocol="multi-hop")
+    again.fly(Pose(-3.0, -1.0, 0.0), 10.0)
+    exchange([b, again], ticks(10.0, 4.0))
+    assert c.evidence.layers[1].provisional.any()
+    for key in (TileKey(column, row) for column in range(-6, 6) for row in range(-6, 6)):
+        np.testing.assert_array_equal(again.evidence.tile(1, key), c.evidence.tile(1, key))
+
+
 def test_a_sketch_tells_nothing_to_who_holds_a_later_version_or_hears_the_source() -> None:
     a = drawn_by_a_source_that_left()[0]
     d = make_drone(4, protocol="multi-hop")
