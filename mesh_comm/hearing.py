@@ -69,7 +69,7 @@ class Hearing:
             case Here():
                 peer.note_here(message, now)
             case Digest():
-                peer.note_digest(message, now, state.settings.max_sources)
+                peer.note_digest(message, now, state.settings.max_sources, state.evidence)
                 state.exchange.receipts.settle(sender, peer.holds, now)
             case messages.Scan():
                 peer.note_pose(message.pose, message.stamp, now)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from imagine.core.errors import InputError
-from imagine.core.evidence import TileKey
+from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import Pose
 from imagine.mesh_comm.codec import unpack_versions
 from imagine.mesh_comm.digest import Held
@@ -70,10 +70,11 @@ class PeerRecord:
             self.velocity = here.velocity
         self.note_pose(here.pose, here.stamp, now)
 
-    def note_digest(self, digest: Digest, now: float, max_sources: int) -> None:
+    def note_digest(self, digest: Digest, now: float, max_sources: int, grid: EvidenceMap) -> None:
         """Take what the peer says it holds, interval by interval; an older digest than the last is left out.
 
-        Raises InputError on a damaged list and on more than `max_sources` sources, then with nothing taken.
+        Of a source more tiles than `grid` has places are kept only where these are: no others could be sent, and that
+        bounds the memory, whatever a digest claims. Raises InputError on a damaged list and on more than `max_sources` sources, then with nothing taken.
         """
         if digest.stamp < self.digest_stamp:
             return
@@ -87,6 +88,8 @@ class PeerRecord:
             if holding.after is not None or holding.until is not None:
                 kept = {key: version for key, version in known.versions.items() if not _covers(holding, key)}
                 versions = kept | versions
+            if len(versions) > grid.tile_rows * grid.tile_columns:
+                versions = {key: version for key, version in versions.items() if _is_on(grid, key)}
             self.holdings[holding.source] = Held(holding.boot, versions)
         self.digest_stamp, self.digest_at = digest.stamp, now
 
@@ -131,6 +134,11 @@ def _versions(holding: Holding) -> dict[TileKey, int]:
     if not all(_covers(holding, key) for key in versions):
         raise InputError(f"mesh digest of source {holding.source} lists tiles outside its own interval")
     return versions
+
+
+def _is_on(grid: EvidenceMap, key: TileKey) -> bool:
+    row, column = key.row - grid.corner.row, key.column - grid.corner.column
+    return 0 <= row < grid.tile_rows and 0 <= column < grid.tile_columns
 
 
 def _covers(holding: Holding, key: TileKey) -> bool:
