@@ -74,7 +74,9 @@ class PeerRecord:
         """Take what the peer says it holds, interval by interval; an older digest than the last is left out.
 
         Of a source more tiles than `grid` has places are kept only where these are: no others could be sent, and that
-        bounds the memory, whatever a digest claims. Raises InputError on a damaged list and on more than `max_sources` sources, then with nothing taken.
+        bounds the memory, whatever a digest claims.
+
+        Raises InputError on a damaged list and on more than `max_sources` sources, then with nothing taken.
         """
         if digest.stamp < self.digest_stamp:
             return

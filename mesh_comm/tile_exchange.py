@@ -110,7 +110,7 @@ class TileExchange:
         self._queue = [wanted for wanted in self._queue if wanted.source != source]
 
     def note_met(self, peer: int) -> None:
-        """Take it that a peer came into reach, or started anew: what it was sketched before, it may not have any more."""
+        """Take it that a peer came into reach, or started anew: what it was sketched before may be gone."""
         self._sketched = {of: known for of, known in self._sketched.items() if of[0] != peer}
 
     def note_overheard(self, source: int, tile: Tile, now: float) -> None:

@@ -275,6 +275,23 @@ def test_a_tight_budget_starves_neither_scans_nor_tiles() -> None:
     assert a.node.bytes_sent["tile"] > 2000
 
 
+def test_digests_of_a_large_team_leave_bytes_for_maps_at_a_very_low_rate() -> None:
+    a, b = (make_drone(i, protocol="multi-hop", rate_bytes_per_s=833.0, burst_bytes=1200.0) for i in (1, 2))
+    rng = np.random.default_rng(3)
+    cells = np.full((32, 32), -8, np.int8)
+    for source in range(3, 17):
+        tiles = [Tile(i % 8 - 4, i // 8 - 2, int(rng.integers(1, 900)), pack_tile(cells)) for i in range(40)]
+        a.node.receive(Sealer(KEY, source, 1).seal(messages.encode(Tiles(source, tiles, 1)), 0.0), 0.0)
+    for now in ticks(0.0, 40.0):
+        a.fly(Pose(0.02 * float(now), 0.0, 0.0), float(now))
+        b.fly(Pose(0.0, 1.0, 0.0), float(now))
+        exchange([a, b], np.array([now]))
+    sent = a.node.bytes_sent
+    assert sent["digest"] < 0.6 * sum(sent.values())
+    assert sent["scan"] + sent["tile"] > 0.15 * sum(sent.values())
+    assert b.evidence.versions(1)
+
+
 def test_a_scan_of_many_beams_still_fits_a_datagram() -> None:
     from imagine.core.lidar import LidarSpec
     from imagine.mesh_comm.scan_exchange import draw_peer_scan, scan_message
