@@ -16,7 +16,7 @@ from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import Pose
 from imagine.core.lidar import Scan
 from imagine.mesh_comm import messages
-from imagine.mesh_comm.codec import pack_tile, unpack_ranges
+from imagine.mesh_comm.codec import pack_tile, pack_versions, unpack_ranges
 from imagine.mesh_comm.messages import MAX_DATAGRAM, Digest, Status, Tile, Tiles
 from imagine.mesh_comm.node import MeshNode, MeshSettings
 from imagine.mesh_comm.orders import Orders
@@ -501,6 +501,20 @@ def test_recorded_orders_do_nothing_to_a_drone_that_has_just_started(target: int
     ground.node.send_command("hold", target, 5.3)
     exchange([ground, again], ticks(5.3, 1.0))
     assert [c.action for c in again.node.commands()] == ["hold"]
+
+
+def test_whoever_tells_the_ground_of_a_start_that_never_was_cannot_keep_a_drone_from_landing() -> None:
+    ground, drone = make_drone(0), make_drone(1, boot=5)
+    drone.node.set_status(Status(1, 0.0, Pose(0.0, 0.0, 0.0)))
+    exchange([ground, drone], ticks(0.0, 0.3))
+    lie = Digest(0.0, [messages.Holding(1, None, None, pack_versions({}), 2**32 - 1)])
+    ground.node.receive(Sealer(KEY, 9, 1).seal(messages.encode(lie), 0.3), 0.3)
+    for now, action in ((0.4, "resume"), (1.4, "land")):
+        ground.node.send_command(action, 1, now)
+        (order,) = carrying(ground.poll(now), messages.Command)
+        drone.node.receive(order, now)
+    assert [command.action for command in drone.node.commands()] == ["land"]
+    assert drone.node.stats == {"old-life": 1}
 
 
 def test_an_order_to_fly_on_is_refused_without_the_drones_name_and_passed_over_where_it_names_others() -> None:
