@@ -133,14 +133,14 @@ def test_news_of_a_restart_by_a_relay_ends_a_place_as_the_restarted_drone_itself
     for life in (first, again):
         life.fly(Pose(0.0, 0.0, 0.0), now)
         relay.fly(Pose(1.0, 0.0, 0.0), now)
-        exchange([life, relay], now + 0.1 * np.arange(30))
-        exchange([relay, listening], now + 3.0 + 0.1 * np.arange(30))
+        exchange([life, relay], np.array([now + 0.1 * tick for tick in range(30)]))
+        exchange([relay, listening], np.array([now + 3.0 + 0.1 * tick for tick in range(30)]))
         assert listening.evidence.layers[2].boot == life.evidence.layers[2].boot
         if life is first:
             listening.evidence.place(2, Pose(1.0, 2.0, 0.5))
         now += 10.0
     assert listening.node.place(2).pose is None
-    exchange([again, listening], now + 0.1 * np.arange(5))
+    exchange([again, listening], np.array([now + 0.1 * tick for tick in range(5)]))
     assert listening.node.place(2).pose is None
 
 
