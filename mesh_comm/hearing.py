@@ -60,15 +60,16 @@ class Hearing:
         peer = state.peers.hear(opened, now)
         if peer.met is None:
             peer.met = state.evidence.versions(state.id)
-        if sender in state.evidence.layers:
-            self._renew(sender, opened.boot)
+            state.exchange.note_met(sender)
+        if sender in state.evidence.layers:  # what an earlier start saw, from where it was, counts no more
+            state.maps.renew(sender, opened.boot)
         match message:
             case Status():
                 peer.note_status(message, now)
             case Here():
                 peer.note_here(message, now)
             case Digest():
-                peer.note_digest(message, now, state.settings.max_sources)
+                peer.note_digest(message, now, state.settings.max_sources, state.evidence)
                 state.exchange.receipts.settle(sender, peer.holds, now)
             case messages.Scan():
                 peer.note_pose(message.pose, message.stamp, now)
@@ -108,15 +109,6 @@ class Hearing:
             return  # nobody knows it better than the source, which is heard here
         elif state.id == GROUND or state.settings.protocol == "multi-hop":
             state.maps.take_sketch(message, via, now)
-
-    def _renew(self, source: int, boot: int) -> None:
-        """Take it that a peer is in start number `boot`: what an earlier one saw, from where it was, counts no more."""
-        state = self._state
-        if state.evidence.layers[source].boot >= boot:
-            return
-        state.maps.renew(source, boot)
-        if state.placements is not None:
-            state.placements.forget(source)
 
     def _drop(self, reason: str, sender: int, error: InputError) -> None:
         self._state.dropped[reason] += 1

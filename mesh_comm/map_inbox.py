@@ -13,6 +13,7 @@ from imagine.mesh_comm import messages
 from imagine.mesh_comm.codec import unpack_tile
 from imagine.mesh_comm.known_cells import KnownCells
 from imagine.mesh_comm.messages import Sketch, Tiles, tile_key
+from imagine.mesh_comm.placement import Placements
 from imagine.mesh_comm.provenance import CellProvenance, Provenance
 from imagine.mesh_comm.scan_exchange import draw_peer_scan
 from imagine.mesh_comm.settings import MeshSettings
@@ -22,11 +23,14 @@ from imagine.mesh_comm.tile_exchange import TileExchange
 class MapInbox:
     """Writes what peers send into `evidence`, and counts cells first known by own scans, peers' scans, and tiles."""
 
-    def __init__(self, evidence: EvidenceMap, exchange: TileExchange, settings: MeshSettings) -> None:
-        """Start with all counts at zero."""
+    def __init__(
+        self, evidence: EvidenceMap, exchange: TileExchange, settings: MeshSettings, placements: Placements | None
+    ) -> None:
+        """Start with all counts at zero; `placements` None where all frames are one."""
         self.own_cells = self.scan_cells = self.map_cells = 0
         self._evidence = evidence
         self._exchange = exchange
+        self._placements = placements
         self._settings = settings
         self._known = KnownCells(evidence)
         self._provenance = Provenance(evidence)
@@ -48,6 +52,8 @@ class MapInbox:
         if layer is not None and layer.boot < boot:
             self._exchange.forget(source)
             self._provenance.forget(source)
+            if self._placements is not None:  # whoever told of the new start: its frame begins elsewhere
+                self._placements.forget(source)
         return self._evidence.renew(source, boot)
 
     def take_scan(self, scan: messages.Scan, boot: int, teammates: NDArray[np.float64], now: float) -> None:

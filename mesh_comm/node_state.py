@@ -37,7 +37,7 @@ class NodeState:
         self.placements = None if evidence.shares_frame else Placements(evidence, settings.alignment, settings.launches)
         self.peers = PeerBook(settings, evidence.placement)
         self.exchange = TileExchange(evidence, settings)
-        self.maps = MapInbox(evidence, self.exchange, settings)
+        self.maps = MapInbox(evidence, self.exchange, settings, self.placements)
         self.orders = Orders(self.id, sealer.boot, settings.command_repeat_s)
         self.pose: Pose | None = None
         self.dropped: Counter[str] = Counter()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from imagine.core.errors import InputError
-from imagine.core.evidence import TileKey
+from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import Pose
 from imagine.mesh_comm.codec import unpack_versions
 from imagine.mesh_comm.digest import Held
@@ -40,6 +40,7 @@ class PeerRecord:
     pose_at: float = -math.inf
     velocity: tuple[float, float] = (0.0, 0.0)
     status: Status | None = None
+    status_stamp: float = -math.inf
     digest_at: float = -math.inf
     digest_stamp: float = -math.inf
     holdings: dict[int, Held] = field(default_factory=dict)
@@ -49,7 +50,7 @@ class PeerRecord:
     def restart(self, boot: int) -> None:
         """Forget what ended with the peer's restart: its clock begins anew and its map is empty."""
         self.boot = boot
-        self.pose_stamp = self.digest_stamp = self.digest_at = -math.inf
+        self.pose_stamp = self.status_stamp = self.digest_stamp = self.digest_at = -math.inf
         self.holdings, self.met = {}, None
 
     def note_pose(self, pose: Pose, stamp: float, now: float) -> None:
@@ -59,8 +60,8 @@ class PeerRecord:
 
     def note_status(self, status: Status, now: float) -> None:
         """Take a status unless a newer one is known."""
-        if self.status is None or status.stamp >= self.status.stamp or self.pose_stamp == -math.inf:
-            self.status, self.velocity = status, status.velocity
+        if status.stamp >= self.status_stamp:
+            self.status, self.status_stamp, self.velocity = status, status.stamp, status.velocity
         self.note_pose(status.pose, status.stamp, now)
 
     def note_here(self, here: Here, now: float) -> None:
@@ -69,8 +70,11 @@ class PeerRecord:
             self.velocity = here.velocity
         self.note_pose(here.pose, here.stamp, now)
 
-    def note_digest(self, digest: Digest, now: float, max_sources: int) -> None:
+    def note_digest(self, digest: Digest, now: float, max_sources: int, grid: EvidenceMap) -> None:
         """Take what the peer says it holds, interval by interval; an older digest than the last is left out.
+
+        Of a source more tiles than `grid` has places are kept only where these are: no others could be sent, and that
+        bounds the memory, whatever a digest claims.
 
         Raises InputError on a damaged list and on more than `max_sources` sources, then with nothing taken.
         """
@@ -86,6 +90,8 @@ class PeerRecord:
             if holding.after is not None or holding.until is not None:
                 kept = {key: version for key, version in known.versions.items() if not _covers(holding, key)}
                 versions = kept | versions
+            if len(versions) > grid.tile_rows * grid.tile_columns:
+                versions = {key: version for key, version in versions.items() if _is_on(grid, key)}
             self.holdings[holding.source] = Held(holding.boot, versions)
         self.digest_stamp, self.digest_at = digest.stamp, now
 
@@ -110,8 +116,10 @@ class PeerRecord:
         return known.versions.get(key, 0) if known.boot == boot else math.inf
 
     def hears(self, other: int, within_s: float) -> bool:
-        """Tell whether the peer, by its last status, heard node `other` within the last seconds."""
-        return self.status is not None and self.status.links.get(other, math.inf) <= within_s
+        """Tell whether the peer, by the last status of its present start, heard node `other` lately."""
+        if self.status is None or self.status_stamp == -math.inf:
+            return False
+        return self.status.links.get(other, math.inf) <= within_s
 
     def position(self, now: float) -> tuple[float, float] | None:
         """Return where the peer should be now, by its last pose and velocity; None if never told."""
@@ -128,6 +136,11 @@ def _versions(holding: Holding) -> dict[TileKey, int]:
     if not all(_covers(holding, key) for key in versions):
         raise InputError(f"mesh digest of source {holding.source} lists tiles outside its own interval")
     return versions
+
+
+def _is_on(grid: EvidenceMap, key: TileKey) -> bool:
+    row, column = key.row - grid.corner.row, key.column - grid.corner.column
+    return 0 <= row < grid.tile_rows and 0 <= column < grid.tile_columns
 
 
 def _covers(holding: Holding, key: TileKey) -> bool:

@@ -109,6 +109,10 @@ class TileExchange:
         self._sketched = {of: known for of, known in self._sketched.items() if of[1] != source}
         self._queue = [wanted for wanted in self._queue if wanted.source != source]
 
+    def note_met(self, peer: int) -> None:
+        """Take it that a peer came into reach, or started anew: what it was sketched before may be gone."""
+        self._sketched = {of: known for of, known in self._sketched.items() if of[0] != peer}
+
     def note_overheard(self, source: int, tile: Tile, now: float) -> None:
         """Take it that those in reach have a tile another node just sent: no need to pass it on at once."""
         key = tile_key(tile)

@@ -43,7 +43,7 @@ from imagine.sim.air_tiles import claim, copy_tile, find_spans
 # these are those of mesh_comm.node, tile_exchange and digest
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4
-_DIGEST_SHARE, _MOST_DIGEST_S = 0.125, 1.5
+_DIGEST_SHARE, _MOST_DIGEST_S, _MOST_DIGEST_SHARE = 0.125, 1.5, 0.5
 _STATUS_SHARE, _MOST_STATUS_S = 0.125, 2.0
 _HERE_SHARE, _MOST_HERE_S = 0.2, 1.0
 _SCANS_BEFORE_NEWS, _SCANS_BEFORE_REPEATS = 1, 4
@@ -303,8 +303,9 @@ def _send_digests(rules, now, drone, node, messages, counters, digests, versions
                     copy[source, tile] = versions[source, tile // tile_columns, tile % tile_columns]
             node.digests += 1
         node.digest_bytes += size
-        spread = node.digest_bytes / (_DIGEST_SHARE * budget)
-        node.next_digest = max(node.next_digest, node.digest_at + min(_MOST_DIGEST_S, spread))
+        spread = min(_MOST_DIGEST_S, node.digest_bytes / (_DIGEST_SHARE * budget))
+        spread = max(spread, node.digest_bytes / (_MOST_DIGEST_SHARE * budget))
+        node.next_digest = max(node.next_digest, node.digest_at + spread)
         node.digest_units -= last - first
         node.digest_parts -= 1
         node.digest_unit = last % (sources * units)
