@@ -7,8 +7,9 @@ bytes, however damaged, take more time or memory to read than sound ones.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,14 @@ from imagine.core.raster import LIMIT, RANGE_STEP_M, TILE
 from imagine.mesh_comm.chances import load_chances
 from imagine.mesh_comm.range_coder import MOST_NUMBER_STEPS, ONE, encode_steps
 from imagine.mesh_comm.scan_model import FIRST_RANGE, INVALID, MOST_BEAM_STEPS, NO_RETURN, decode_scan, scan_steps
-from imagine.mesh_comm.tile_model import MOST_TILE_STEPS, PLAIN_TILE_BYTES, decode_tile, plain_tile_steps, tile_steps
+from imagine.mesh_comm.tile_model import (
+    MOST_TILE_STEPS,
+    PLAIN_TILE_BYTES,
+    decode_tile,
+    decode_tiles,
+    plain_tile_steps,
+    tile_steps,
+)
 from imagine.mesh_comm.version_model import (
     MOST_ENTRY_STEPS,
     MOST_LISTED,
@@ -31,6 +39,8 @@ from imagine.mesh_comm.version_model import (
 )
 
 _CHANCES = load_chances()
+SCAN_CHANCES = _CHANCES.scan
+"""Where the chances of every scan start, int64 `[SCAN_CONTEXTS]`; not to be changed."""
 _AS_KEY = partial(tuple.__new__, TileKey)  # TileKey._make without Python's part of it: lists are long
 _SPARE_BYTES = 8  # what the coder wants free behind its last byte
 _MOST_BEAM_BYTES = 24  # no step takes more than 11 bits: two of kind, 12 and 11 of a size up to 3000, one of sign
@@ -66,7 +76,7 @@ def unpack_ranges(packed: bytes, beams: int, range_cap: float) -> NDArray[np.flo
     codes = np.empty(beams, np.int64)
     if not decode_scan(np.frombuffer(packed, np.uint8), _CHANCES.scan.copy(), largest_code(range_cap), codes):
         raise InputError(f"mesh scan: {len(packed)} bytes do not tell {beams} ranges up to {range_cap} m")
-    ranges: NDArray[np.float32] = _metres(range_cap)[codes]
+    ranges: NDArray[np.float32] = code_metres(range_cap)[codes]
     return ranges
 
 
@@ -88,6 +98,16 @@ def unpack_tile(packed: bytes) -> NDArray[np.int8]:
     cells = np.empty((TILE, TILE), np.int8)
     if not decode_tile(np.frombuffer(packed, np.uint8), _CHANCES.tile, cells):
         raise InputError(f"mesh tile: {len(packed)} bytes do not tell {TILE}x{TILE} cells within ±{LIMIT}")
+    return cells
+
+
+def unpack_tiles(packed: Sequence[bytes]) -> NDArray[np.int8]:
+    """Return the cells of tiles, int8 `[n, TILE, TILE]`, each as `unpack_tile` does. Raises InputError if any fails."""
+    ends = np.array(list(accumulate(map(len, packed))), np.int64)
+    cells = np.empty((len(packed), TILE, TILE), np.int8)
+    sound = decode_tiles(np.frombuffer(b"".join(packed), np.uint8), ends, _CHANCES.tile, cells)
+    if sound < len(packed):
+        raise InputError(f"mesh tile: {len(packed[sound])} bytes do not tell {TILE}x{TILE} cells within ±{LIMIT}")
     return cells
 
 
@@ -117,7 +137,7 @@ def unpack_versions(packed: bytes) -> dict[TileKey, int]:
 
 
 @lru_cache(maxsize=8)
-def _metres(range_cap: float) -> NDArray[np.float32]:
+def code_metres(range_cap: float) -> NDArray[np.float32]:
     """Return the range in metres of every code up to the largest."""
     steps = np.arange(largest_code(range_cap) + 1) - FIRST_RANGE
     metres: NDArray[np.float32] = np.minimum(steps * RANGE_STEP_M, range_cap).astype(np.float32)

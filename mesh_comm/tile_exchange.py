@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -90,17 +90,12 @@ class TileExchange:
         """The tile that goes out next, if any is wanted."""
         return self._queue[0] if self._queue else None
 
-    def merge(self, source: int, tile: Tile, cells: NDArray[np.int8]) -> bool:
-        """Take a tile heard from a peer if it is newer than what is held; tell whether it was taken.
-
-        `cells` int8 `[TILE, TILE]`, unpacked from the tile. Raises InputError on a tile too far away to hold.
-        """
-        key = tile_key(tile)
-        if not self._evidence.merge_tile(source, key, tile.version, cells):
-            return False
+    def confirm(self, source: int, tiles: Iterable[Tile]) -> None:
+        """Take it that the newest of a source's tiles that are held are these, as the source confirmed them."""
         # kept apart from the layer: scans drawn ahead of the next version must not be passed on
-        self._confirmed.setdefault(source, {})[key] = Content(tile.version, tile.packed)
-        return True
+        confirmed = self._confirmed.setdefault(source, {})
+        for tile in tiles:
+            confirmed[tile_key(tile)] = Content(tile.version, tile.packed)
 
     def forget(self, source: int) -> None:
         """Drop the tiles of a source that has started anew."""
@@ -109,12 +104,17 @@ class TileExchange:
         self._sketched = {of: known for of, known in self._sketched.items() if of[1] != source}
         self._queue = [wanted for wanted in self._queue if wanted.source != source]
 
-    def note_overheard(self, source: int, tile: Tile, now: float) -> None:
-        """Take it that those in reach have a tile another node just sent: no need to pass it on at once."""
-        key = tile_key(tile)
-        held = self._confirmed.get(source, {}).get(key)
-        if held is None or held.version <= tile.version:
-            self._sent[source, key] = _Sent(tile.version, now, self._known(source, key))
+    def note_overheard(self, source: int, tiles: Sequence[Tile], known: Sequence[int], now: float) -> None:
+        """Take it that those in reach have what another node just sent: no need to pass it on at once.
+
+        `known`: how many cells have evidence on each of the tiles, as they are held here.
+        """
+        confirmed = self._confirmed.get(source, {})
+        for tile, cells in zip(tiles, known, strict=True):
+            key = tile_key(tile)
+            held = confirmed.get(key)
+            if held is None or held.version <= tile.version:
+                self._sent[source, key] = _Sent(tile.version, now, cells)
 
     def plan(self, peers: Sequence[PeerRecord], now: float) -> None:
         """Make the queue anew: tiles that some of `peers`, by their digests, lack and that may be sent at `now`.
