@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import accumulate
 
 import numpy as np
@@ -29,19 +29,20 @@ from imagine.mesh_comm.tile_model import (
     tile_steps,
 )
 from imagine.mesh_comm.version_model import (
+    KEY_BIAS,
+    KEY_SPAN,
     MOST_ENTRY_STEPS,
     MOST_LISTED,
+    OVERLONG,
     TILES_A_BYTE,
     VERSION_CONTEXTS,
-    decode_count,
-    decode_entries,
+    decode_versions,
     version_steps,
 )
 
 _CHANCES = load_chances()
 SCAN_CHANCES = _CHANCES.scan
 """Where the chances of every scan start, int64 `[SCAN_CONTEXTS]`; not to be changed."""
-_AS_KEY = partial(tuple.__new__, TileKey)  # TileKey._make without Python's part of it: lists are long
 _SPARE_BYTES = 8  # what the coder wants free behind its last byte
 _MOST_BEAM_BYTES = 24  # no step takes more than 11 bits: two of kind, 12 and 11 of a size up to 3000, one of sign
 _MOST_ENTRY_BYTES = 192  # three numbers, each of at most 40 steps that learn, and 39 digits
@@ -125,15 +126,27 @@ def pack_versions(versions: Mapping[TileKey, int]) -> bytes:
 
 def unpack_versions(packed: bytes) -> dict[TileKey, int]:
     """Return the tile versions of `pack_versions`. Raises InputError on bytes that tell no list."""
-    data, zeros = np.frombuffer(packed, np.uint8), np.empty(VERSION_CONTEXTS, np.int64)
-    count, state = decode_count(data, zeros)
-    if count > min(TILES_A_BYTE * (len(packed) + 1), MOST_LISTED):
-        raise InputError(f"mesh version list: {len(packed)} bytes claim to tell of {count} tiles")
-    entries = np.empty((count, 3), np.int64)
-    if not decode_entries(data, zeros, state, entries):
-        raise InputError(f"mesh version list: {len(packed)} bytes do not tell of {count} tiles that a map can hold")
-    columns, rows, versions = entries.T.tolist()
-    return dict(zip(map(_AS_KEY, zip(columns, rows, strict=True)), versions, strict=True))
+    return {
+        TileKey(code // KEY_SPAN - KEY_BIAS, code % KEY_SPAN - KEY_BIAS): version
+        for code, version in unpack_coded_versions(packed).items()
+    }
+
+
+def unpack_coded_versions(packed: bytes) -> dict[int, int]:
+    """Return what `unpack_versions` does by `tile_code`, which takes a third of the time."""
+    room = min(TILES_A_BYTE * (len(packed) + 1), MOST_LISTED)
+    codes, versions = np.empty((2, room), np.int64)
+    count = decode_versions(np.frombuffer(packed, np.uint8), codes, versions)
+    if count == OVERLONG:
+        raise InputError(f"mesh version list: {len(packed)} bytes claim to tell of more than {room} tiles")
+    if count < 0:
+        raise InputError(f"mesh version list: {len(packed)} bytes do not tell of tiles that a map can hold")
+    return dict(zip(codes[:count].tolist(), versions[:count].tolist(), strict=True))
+
+
+def tile_code(key: tuple[int, int]) -> int:
+    """Return one number for a tile's column and row, within the largest map; numbers are in order where keys are."""
+    return (key[0] + KEY_BIAS) * KEY_SPAN + key[1] + KEY_BIAS
 
 
 @lru_cache(maxsize=8)

@@ -103,7 +103,7 @@ class MapInbox:
         columns, rows = [tile.column for tile in tiles], [tile.row for tile in tiles]
         self._evidence.cover_tiles(min(columns), min(rows), max(columns), max(rows))
 
-    def _within_reach(self, tiles: Sequence[Tile]) -> Sequence[Tile]:
+    def _within_reach(self, tiles: list[Tile]) -> list[Tile]:
         """Return the tiles before the first that no map can hold beside those before it; the grid grows for them."""
         for count in range(len(tiles)):
             try:

@@ -38,8 +38,8 @@ def draw_packed_scan(  # type: ignore[no-untyped-def]
     codes stand for. Pose, `start` and `increment` in metres and radians, the frame of the layer; `directions` of
     `beam_directions`; `reach`, `width`, `starts`, `offsets` of the cap's `RayTable`. Returns within `radius` of
     `targets` (float64 `[n, 2]`) are left out. `cells`, `versions`, `provisional` are the layer, the grid's first cell
-    (`grid_row`, `grid_column`); tiles of version `clock` or later stay. `known` and `found` as in `find_marked`, `known`
-    empty where nobody counts. Nothing is drawn of a damaged scan.
+    (`grid_row`, `grid_column`); tiles of version `clock` or later stay. `known` and `found` are those of `find_marked`,
+    `known` empty where nobody counts. Nothing is drawn of a damaged scan.
     """
     codes = np.empty(beams, np.int64)
     if not decode_scan(packed, chances.copy(), len(metres) - 1, codes):

@@ -1,4 +1,4 @@
-"""What happens to a message of tiles when it arrives, in one compiled pass: the newer ones into their source's layer."""
+"""What happens to a message of tiles when it arrives, in one compiled pass: the newer ones are written."""
 
 from __future__ import annotations
 

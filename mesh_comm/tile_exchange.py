@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import IDENTITY
