@@ -21,7 +21,7 @@ from imagine.mesh_comm.information import (
 )
 from imagine.mesh_comm.messages import GROUND, Sketch, Tile, Tiles, tile_key
 from imagine.mesh_comm.peers import PeerRecord
-from imagine.mesh_comm.receipts import Receipts
+from imagine.mesh_comm.receipts import Receipts, shares
 from imagine.mesh_comm.settings import MeshSettings
 
 _TILE_BYTES = 16  # a tile beside its packed cells: place, version and lengths, at their longest
@@ -176,7 +176,7 @@ class TileExchange:
     def note_sent(self, message: Tiles | Sketch, size: int, now: float) -> None:
         """Take the tiles of a message that went out, in `size` sealed bytes, off the queue."""
         gone = {tile_key(tile): tile for tile in message.tiles}
-        packed = max(1, sum(len(tile.packed) for tile in message.tiles))
+        share = dict(zip(gone, shares(size, [len(tile.packed) for tile in message.tiles]), strict=True))
         left: list[Wanted] = []
         for wanted in self._queue:
             is_of = wanted.source == message.source and wanted.is_sketch == isinstance(message, Sketch)
@@ -186,14 +186,13 @@ class TileExchange:
                 continue
             if wanted.is_sketch:
                 self._sketched |= {(peer, wanted.source, wanted.key): wanted.known for peer in wanted.told}
-                self.receipts.note_sketch(round(size * len(tile.packed) / packed), wanted.told)
+                self.receipts.note_sketch(share[wanted.key], wanted.told)
                 continue
             self._sent[message.source, wanted.key] = _Sent(tile.version, now, wanted.known)
             self._since.pop((wanted.source, wanted.key), None)
-            share = round(size * len(tile.packed) / packed)
             self.receipts.note_tile(
-                message.source, message.boot, wanted.key, tile.version, share, wanted.told, now
-            )  # fmt: skip
+                message.source, message.boot, wanted.key, tile.version, share[wanted.key], wanted.told, now
+            )
         self._queue = left
 
     def _sketches(self, peers: Sequence[PeerRecord], now: float) -> list[Wanted]:
