@@ -23,6 +23,7 @@ from imagine.mesh_comm.messages import GROUND, Sketch, Tile, Tiles, tile_key
 from imagine.mesh_comm.peers import PeerRecord
 from imagine.mesh_comm.receipts import Receipts, shares
 from imagine.mesh_comm.settings import MeshSettings
+from imagine.mesh_comm.wanted import Wanted
 
 _TILE_BYTES = 16  # a tile beside its packed cells: place, version and lengths, at their longest
 _TILES_BYTES = 15
@@ -45,27 +46,6 @@ class _Sent(NamedTuple):
     version: int
     at: float
     known: int
-
-
-class Wanted(NamedTuple):
-    """A tile that peers lack, since when; `told`: the cells it would tell each of them, `worth` so much in all.
-
-    `is_sketch`: it goes out as it is drawn here, with scans that its source confirms no more.
-    """
-
-    rank: tuple[float, ...]
-    source: int
-    key: TileKey
-    since: float
-    told: dict[int, int]
-    worth: int
-    known: int
-    is_sketch: bool = False
-
-    @property
-    def brings_news(self) -> bool:
-        """Whether it tells some peer a cell that it does not know, as far as is known here."""
-        return self.worth > 0
 
 
 class TileExchange:
