@@ -180,3 +180,16 @@ def test_with_few_bytes_tiles_that_tell_more_go_first() -> None:
         sizes.append(int((b.evidence.belief() != 0).sum()))
     first = next(size for size in sizes if size)
     assert first > 0.5 * sizes[-1]  # the first datagram of tiles brought more than all later ones
+
+
+@QUICK
+@given(weathers, st.integers(0, 2**16))
+def test_no_cell_becomes_known_unnoticed(seconds: list[Weather], seed: int) -> None:
+    drones, _ = live_through(seconds, seed, 3, "multi-hop", "information")
+    for drone in drones:
+        evidence, maps = drone.evidence, drone.node._state.maps
+        known = int((sum(layer.cells.astype(int) for layer in evidence.layers.values()) != 0).sum())
+        assert drone.node.own_cells + drone.node.scan_cells + drone.node.map_cells >= known
+        counted = drone.node.map_cells
+        maps.note_placed()  # looks through the whole map
+        assert drone.node.map_cells == counted
