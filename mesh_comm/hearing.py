@@ -6,8 +6,8 @@ import logging
 
 from imagine.core.errors import InputError
 from imagine.mesh_comm import messages
-from imagine.mesh_comm.codec import unpack_tile
-from imagine.mesh_comm.messages import GROUND, Command, Digest, Here, Message, Sketch, Status, Tiles, tile_key
+from imagine.mesh_comm.codec import unpack_tiles
+from imagine.mesh_comm.messages import GROUND, Command, Digest, Here, Message, Sketch, Status, Tiles
 from imagine.mesh_comm.node_state import NodeState
 from imagine.mesh_comm.peers import PeerRecord
 from imagine.mesh_comm.seal import Opened, Rejected
@@ -89,17 +89,13 @@ class Hearing:
             state.dropped["old-life"] += 1
             return
         if source == state.id:
-            for tile in message.tiles:
-                unpack_tile(tile.packed)
+            unpack_tiles([tile.packed for tile in message.tiles])
         elif is_relayed and state.settings.protocol == "one-hop" and state.id != GROUND:
             return
         else:
             state.maps.take_tiles(message, is_relayed and state.peers.is_live(source, now), peer.id, now)
         # only now that all of it has proved sound: what is noted is kept
-        peer.note_held(source, message.boot, {tile_key(tile): tile.version for tile in message.tiles})
-        if source != state.id:
-            for tile in message.tiles:
-                state.exchange.note_overheard(source, tile, now)
+        peer.note_held(source, message.boot, message.tiles)
 
     def _take_sketch(self, message: Sketch, via: int, now: float) -> None:
         state, source = self._state, message.source

@@ -18,7 +18,7 @@ from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Digest, Here, Messa
 from imagine.mesh_comm.node_state import NodeState
 from imagine.mesh_comm.receipts import Bought
 from imagine.mesh_comm.scan_exchange import scan_message
-from imagine.mesh_comm.tile_exchange import Wanted
+from imagine.mesh_comm.wanted import Wanted
 
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4  # of a longer digest, this many go out per period, in turn
