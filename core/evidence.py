@@ -213,7 +213,7 @@ class EvidenceMap:
             raise InputError(f"a tile is int8 {TILE}x{TILE}, got {cells.dtype} {cells.shape}")
         if not 1 <= version < 2**32:
             raise InputError(f"tile {tuple(key)} of source {source}: version {version} is out of range")
-        self._cover_tiles(key.column, key.row, key.column, key.row)
+        self.cover_tiles(key.column, key.row, key.column, key.row)
         layer = self.layer(source)
         row, column = key.row - self.corner.row, key.column - self.corner.column
         taken = write_tile(layer.cells, layer.versions, layer.provisional, row, column, version, cells)
@@ -233,7 +233,7 @@ class EvidenceMap:
             raise InputError(f"a sketch of source {source} came from outside, but only drone {source} writes it")
         if cells.shape != (TILE, TILE) or cells.dtype != np.int8 or cells.max() > LIMIT or cells.min() < -LIMIT:
             raise InputError(f"sketch {tuple(key)} of source {source} is no int8 {TILE}x{TILE} tile within its bounds")
-        self._cover_tiles(key.column, key.row, key.column, key.row)
+        self.cover_tiles(key.column, key.row, key.column, key.row)
         layer = self.layer(source)
         row, column = key.row - self.corner.row, key.column - self.corner.column
         held = self.tile(source, key)
@@ -308,11 +308,12 @@ class EvidenceMap:
     def cover(self, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
         """Grow the grid to hold a rectangle of the map frame, metres; raise InputError past the largest extent."""
         side = CELL * TILE
-        self._cover_tiles(
+        self.cover_tiles(
             math.floor(x_min / side), math.floor(y_min / side), math.floor(x_max / side), math.floor(y_max / side)
         )
 
-    def _cover_tiles(self, column_min: int, row_min: int, column_max: int, row_max: int) -> None:
+    def cover_tiles(self, column_min: int, row_min: int, column_max: int, row_max: int) -> None:
+        """Grow the grid to hold tiles from the least column and row to the greatest; raise InputError as `cover`."""
         column, row = self.corner
         if (
             column_min >= column

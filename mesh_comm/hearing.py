@@ -6,8 +6,8 @@ import logging
 
 from imagine.core.errors import InputError
 from imagine.mesh_comm import messages
-from imagine.mesh_comm.codec import unpack_tile
-from imagine.mesh_comm.messages import GROUND, Command, Digest, Here, Message, Sketch, Status, Tiles, tile_key
+from imagine.mesh_comm.codec import unpack_tiles
+from imagine.mesh_comm.messages import GROUND, Command, Digest, Here, Message, Sketch, Status, Tiles
 from imagine.mesh_comm.node_state import NodeState
 from imagine.mesh_comm.peers import PeerRecord
 from imagine.mesh_comm.seal import Opened, Rejected
@@ -60,15 +60,16 @@ class Hearing:
         peer = state.peers.hear(opened, now)
         if peer.met is None:
             peer.met = state.evidence.versions(state.id)
-        if sender in state.evidence.layers:
-            self._renew(sender, opened.boot)
+            state.exchange.note_met(sender)
+        if sender in state.evidence.layers:  # what an earlier start saw, from where it was, counts no more
+            state.maps.renew(sender, opened.boot)
         match message:
             case Status():
                 peer.note_status(message, now)
             case Here():
                 peer.note_here(message, now)
             case Digest():
-                peer.note_digest(message, now, state.settings.max_sources)
+                peer.note_digest(message, now, state.settings.max_sources, state.evidence)
                 state.exchange.receipts.settle(sender, peer.holds, now)
             case messages.Scan():
                 peer.note_pose(message.pose, message.stamp, now)
@@ -88,17 +89,13 @@ class Hearing:
             state.dropped["old-life"] += 1
             return
         if source == state.id:
-            for tile in message.tiles:
-                unpack_tile(tile.packed)
+            unpack_tiles([tile.packed for tile in message.tiles])
         elif is_relayed and state.settings.protocol == "one-hop" and state.id != GROUND:
             return
         else:
             state.maps.take_tiles(message, is_relayed and state.peers.is_live(source, now), peer.id, now)
         # only now that all of it has proved sound: what is noted is kept
-        peer.note_held(source, message.boot, {tile_key(tile): tile.version for tile in message.tiles})
-        if source != state.id:
-            for tile in message.tiles:
-                state.exchange.note_overheard(source, tile, now)
+        peer.note_held(source, message.boot, message.tiles)
 
     def _take_sketch(self, message: Sketch, via: int, now: float) -> None:
         state, source = self._state, message.source
@@ -108,15 +105,6 @@ class Hearing:
             return  # nobody knows it better than the source, which is heard here
         elif state.id == GROUND or state.settings.protocol == "multi-hop":
             state.maps.take_sketch(message, via, now)
-
-    def _renew(self, source: int, boot: int) -> None:
-        """Take it that a peer is in start number `boot`: what an earlier one saw, from where it was, counts no more."""
-        state = self._state
-        if state.evidence.layers[source].boot >= boot:
-            return
-        state.maps.renew(source, boot)
-        if state.placements is not None:
-            state.placements.forget(source)
 
     def _drop(self, reason: str, sender: int, error: InputError) -> None:
         self._state.dropped[reason] += 1

@@ -25,6 +25,8 @@ def write_new_keys(path: Path, ground_path: Path | None = None) -> KeyRing:
     """
     ring = KeyRing.of(secrets.token_bytes(KEY_BYTES))
     if ground_path is not None:
+        if ground_path.absolute() == path.absolute():
+            raise InputError(f"{path}: is named for the drones and for the ground: its signing key needs another file")
         sign = secrets.token_bytes(KEY_BYTES)
         ring = KeyRing(ring.keys, ground_public(sign), sign)
         if path.exists():  # before the first of the two is made

@@ -14,6 +14,8 @@ from imagine.core.frames import IDENTITY, Pose, placed_bounds
 from imagine.core.raster import CELL, TILE
 
 _KNOWN, _CANDIDATE = 1, 2
+NOBODY_COUNTS = np.zeros((0, 0), np.uint8)
+"""A grid of no cells, for kernels that would find what becomes known."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -40,6 +42,54 @@ def _find(cells, known, places, rows, columns, found, count):  # type: ignore[no
                         known_line[column0 + j] = _CANDIDATE
                         found[count] = row * width + column0 + j
                         count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def find_marked(marks, row0, column0, known, found):  # type: ignore[no-untyped-def]
+    """Write into `found` (int32, flat) the cells that a sheet of marks touches and that are not known; count them.
+
+    `marks` int8, whole tiles wide, its first cell at (row0, column0) of the grid, the column a tile's first; `known`
+    uint8 `[rows, columns]`, zero where nothing is known, or empty: then nothing is found.
+    """
+    rows, columns = known.shape
+    count = 0
+    for i in range(max(0, -row0), min(marks.shape[0], rows - row0)):
+        line, known_line = marks[np.uintp(i)], known[np.uintp(row0 + i)]
+        for first in range(max(0, -column0), min(marks.shape[1], columns - column0), TILE):
+            is_any = np.int8(0)
+            for j in range(TILE):  # as in `_find`
+                mark, was_known = line[np.uintp(first + j)], known_line[np.uintp(column0 + first + j)]
+                is_any |= np.int8(mark != 0) & np.int8(was_known == 0)
+            if is_any:
+                for j in range(first, first + TILE):
+                    if line[j] != 0 and known_line[column0 + j] == 0:
+                        found[count] = (row0 + i) * columns + column0 + j
+                        count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def find_changes(cells, tile, row0, column0, known, found, count):  # type: ignore[no-untyped-def]
+    """Add to `found` the cells that are not known and that `tile` (int8 `[TILE, TILE]`) would change; count all.
+
+    The tile's first cell is (row0, column0) of `cells` and `known`, which may be empty as in `find_marked`. What is
+    found becomes a candidate in `known`, so that each is found once.
+    """
+    if known.shape[0] == 0:
+        return count
+    for i in range(TILE):
+        line, known_line = cells[np.uintp(row0 + i)], known[np.uintp(row0 + i)]
+        is_any = np.int8(0)
+        for j in range(TILE):
+            column = np.uintp(column0 + j)
+            is_any |= np.int8(line[column] != tile[i, j]) & np.int8(known_line[column] == 0)
+        if is_any:
+            for j in range(TILE):
+                if line[column0 + j] != tile[i, j] and known_line[column0 + j] == 0:
+                    known_line[column0 + j] = _CANDIDATE
+                    found[count] = (row0 + i) * known.shape[1] + column0 + j
+                    count += 1
     return count
 
 
@@ -98,6 +148,22 @@ class KnownCells:
         ]
         return self._claim_places(layers, np.array(places, np.int64).reshape(-1, 2), TILE, TILE)
 
+    def not_yet(self, source: int) -> NDArray[np.uint8]:
+        """Return the grid in which cells that were never known are 0, for a kernel that finds what it changes of them.
+
+        Good until the map grows. Empty where a source's cells are not cells of the own frame: then what it changed has
+        to be looked for afterwards, by `claim_around` or `claim_tiles`.
+        """
+        if self._evidence.placement(source) != IDENTITY:
+            return NOBODY_COUNTS
+        self._evidence.placed()  # the grid may grow first
+        self._follow_growth()
+        return self._known
+
+    def claim_found(self, found: NDArray[np.int32], count: int) -> int:
+        """Return how many of the first `count` cells found, flat in the grid of `not_yet`, are known by now."""
+        return 0 if count == 0 else self._claim_cells(self._evidence.placed(), found, count)
+
     def _claim_placed(self, pose: Pose, key: TileKey) -> int:
         column, row = key.column * TILE, key.row * TILE
         x, y = (column * CELL, (column + TILE) * CELL), (row * CELL, (row + TILE) * CELL)
@@ -134,8 +200,9 @@ class KnownCells:
         count = 0
         for cells in layers.values():
             count = _find(cells, self._known, places, rows, columns, found, count)
-        if count == 0:
-            return 0
+        return 0 if count == 0 else self._claim_cells(layers, found, count)
+
+    def _claim_cells(self, layers: Mapping[int, NDArray[np.int8]], found: NDArray[np.int32], count: int) -> int:
         total = np.zeros(count, np.int16)
         for cells in layers.values():
             _add(total, cells, found, count)

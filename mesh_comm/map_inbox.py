@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import compress
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,23 +13,28 @@ from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import IDENTITY, Pose, compose
 from imagine.core.raster import CELL
 from imagine.mesh_comm import messages
-from imagine.mesh_comm.codec import unpack_tile
+from imagine.mesh_comm.codec import unpack_tiles
 from imagine.mesh_comm.known_cells import KnownCells
-from imagine.mesh_comm.messages import Sketch, Tiles, tile_key
+from imagine.mesh_comm.messages import Sketch, Tile, Tiles, tile_key
+from imagine.mesh_comm.placement import Placements
 from imagine.mesh_comm.provenance import CellProvenance, Provenance
 from imagine.mesh_comm.scan_exchange import draw_peer_scan
 from imagine.mesh_comm.settings import MeshSettings
+from imagine.mesh_comm.tile_arrival import write_tiles
 from imagine.mesh_comm.tile_exchange import TileExchange
 
 
 class MapInbox:
     """Writes what peers send into `evidence`, and counts cells first known by own scans, peers' scans, and tiles."""
 
-    def __init__(self, evidence: EvidenceMap, exchange: TileExchange, settings: MeshSettings) -> None:
-        """Start with all counts at zero."""
+    def __init__(
+        self, evidence: EvidenceMap, exchange: TileExchange, settings: MeshSettings, placements: Placements | None
+    ) -> None:
+        """Start with all counts at zero; `placements` None where all frames are one."""
         self.own_cells = self.scan_cells = self.map_cells = 0
         self._evidence = evidence
         self._exchange = exchange
+        self._placements = placements
         self._settings = settings
         self._known = KnownCells(evidence)
         self._provenance = Provenance(evidence)
@@ -45,10 +53,15 @@ class MapInbox:
         """
         self._check_source(source)
         layer = self._evidence.layers.get(source)
-        if layer is not None and layer.boot < boot:
-            self._exchange.forget(source)
-            self._provenance.forget(source)
-        return self._evidence.renew(source, boot)
+        if layer is None or layer.boot >= boot:
+            return self._evidence.renew(source, boot)
+        self._exchange.forget(source)
+        self._provenance.forget(source)
+        if self._placements is not None:  # whoever told of the new start: its frame begins elsewhere
+            self._placements.forget(source)
+        counts = self._evidence.renew(source, boot)
+        self.map_cells += self._known.claim_all()  # where the others' evidence shows without what was dropped
+        return counts
 
     def take_scan(self, scan: messages.Scan, boot: int, teammates: NDArray[np.float64], now: float) -> None:
         """Draw a peer's scan, leaving out what lands on `teammates` (`[n, 2]` metres, the peer's frame).
@@ -61,10 +74,11 @@ class MapInbox:
         where = None if frame is None else scan.pose if frame == IDENTITY else compose(frame, scan.pose)
         if where is not None and self._own_counted != self._own_clock:
             self._count_own(where, scan.range_cap_m)
-        draw_peer_scan(self._evidence, scan, teammates, self._settings.mask_radius_m)
+        fresh = draw_peer_scan(self._evidence, scan, teammates, self._settings.mask_radius_m, self._known)
         reach_m = scan.range_cap_m + 2 * CELL
         self._provenance.note_scan(scan.sender, scan.pose.x, scan.pose.y, reach_m, scan.stamp, now)
-        if where is not None:
+        self.scan_cells += fresh
+        if where is not None and frame != IDENTITY:
             self.scan_cells += self._known.claim_around(where.x, where.y, reach_m)
 
     def take_tiles(self, message: Tiles, is_source_near: bool, via: int, now: float) -> None:
@@ -73,27 +87,63 @@ class MapInbox:
         `is_source_near`: these are copies passed on by a third node while the source itself is in reach. Then tiles
         that hold the source's scans are left alone: they show more than the copy, and the source will send its own.
         """
-        unpacked = [unpack_tile(tile.packed) for tile in message.tiles]
-        if not self.renew(message.source, message.boot):
+        source, tiles = message.source, message.tiles
+        unpacked = unpack_tiles([tile.packed for tile in tiles])
+        if source == self._evidence.own:
+            raise InputError(f"tiles of source {source} came from outside, but only drone {source} writes them")
+        if not tiles or not self.renew(source, message.boot):
             return
         if self._own_counted != self._own_clock:
-            self.own_cells += self._known.claim_tiles(message.source, list({tile_key(tile) for tile in message.tiles}))
-        taken: dict[TileKey, None] = {}
+            self.own_cells += self._known.claim_tiles(source, list({tile_key(tile) for tile in tiles}))
+        too_far: InputError | None = None
         try:
-            for tile, cells in zip(message.tiles, unpacked, strict=True):
-                key = tile_key(tile)
-                if is_source_near and self._evidence.is_provisional(message.source, key):
-                    continue
-                if self._exchange.merge(message.source, tile, cells):
-                    self._provenance.note_tile(message.source, key, tile.version, via, now)
-                    taken[key] = None
-        finally:  # a tile too far away to hold ends a message, and those before it are taken
-            if taken:
-                self.map_cells += self._known.claim_tiles(message.source, list(taken))
+            self._cover(tiles)
+        except InputError as error:  # a tile too far away to hold ends a message, and those before it are taken
+            too_far, tiles = error, self._within_reach(tiles)
+        held = self._write(source, tiles, unpacked[: len(tiles)], is_source_near, via, now)
+        if too_far is not None:
+            raise too_far
+        self._exchange.note_overheard(source, tiles, held, now)
+
+    def _cover(self, tiles: Sequence[Tile]) -> None:
+        columns, rows = [tile.column for tile in tiles], [tile.row for tile in tiles]
+        self._evidence.cover_tiles(min(columns), min(rows), max(columns), max(rows))
+
+    def _within_reach(self, tiles: list[Tile]) -> list[Tile]:
+        """Return the tiles before the first that no map can hold beside those before it; the grid grows for them."""
+        for count in range(len(tiles)):
+            try:
+                self._cover(tiles[count : count + 1])
+            except InputError:
+                return tiles[:count]
+        return tiles
+
+    def _write(
+        self, source: int, tiles: Sequence[Tile], unpacked: NDArray[np.int8], is_source_near: bool, via: int, now: float
+    ) -> list[int]:
+        """Write the newer ones of tiles that the grid holds; return how many cells have evidence on each then."""
+        evidence, known = self._evidence, self._known.not_yet(source)
+        layer, corner = evidence.layers[source], evidence.corner
+        entries = np.array([(tile.column, tile.row, tile.version) for tile in tiles], np.int64).reshape(-1, 3)
+        found = np.empty(unpacked.size, np.int32)
+        taken, held = np.empty(len(tiles), np.bool_), np.empty(len(tiles), np.int64)
+        count = write_tiles(
+            unpacked, entries, is_source_near, layer.cells, layer.versions, layer.provisional,
+            corner.row, corner.column, known, found, taken, held,
+        )  # fmt: skip
+        news = list(compress(tiles, taken.tolist()))
+        if news:
+            layer.clock = max(layer.clock, *(tile.version for tile in news))
+            self._exchange.confirm(source, news)
+            self._provenance.note_tiles(source, entries, taken, via, now)
+            self.map_cells += self._known.claim_found(found, count)
+            if evidence.placement(source) != IDENTITY:
+                self.map_cells += self._known.claim_tiles(source, list(dict.fromkeys(map(tile_key, news))))
+        return held.tolist()
 
     def take_sketch(self, message: Sketch, via: int, now: float) -> None:
         """Fill in what node `via` heard of a source that is out of reach here. Raises InputError with none taken."""
-        unpacked = [unpack_tile(tile.packed) for tile in message.tiles]
+        unpacked = unpack_tiles([tile.packed for tile in message.tiles])
         if not self.renew(message.source, message.boot):
             return
         if self._own_counted != self._own_clock:

@@ -37,7 +37,7 @@ class NodeState:
         self.placements = None if evidence.shares_frame else Placements(evidence, settings.alignment, settings.launches)
         self.peers = PeerBook(settings, evidence.placement)
         self.exchange = TileExchange(evidence, settings)
-        self.maps = MapInbox(evidence, self.exchange, settings)
+        self.maps = MapInbox(evidence, self.exchange, settings, self.placements)
         self.orders = Orders(self.id, sealer.boot, settings.command_repeat_s)
         self.pose: Pose | None = None
         self.dropped: Counter[str] = Counter()
@@ -69,7 +69,8 @@ class NodeState:
         frame = self.evidence.placement(scanner)
         if frame is None:
             return np.zeros((0, 2))
-        others = self.peers.positions(now, leave_out=scanner)
+        others = self.peers.places(now, leave_out=scanner)
         if self.pose is not None:
-            others = np.concatenate((others, (self.pose[:2],)))
-        return others if frame == IDENTITY else transform_points(inverse(frame), others)
+            others.append((self.pose[0], self.pose[1]))
+        places = np.array(others, np.float64).reshape(-1, 2)
+        return places if frame == IDENTITY else transform_points(inverse(frame), places)

@@ -80,7 +80,8 @@ class Orders:
         It is passed on as it came under every protocol: a pilot's order must reach drones out of the ground's reach.
         The seal proves that it is the ground's, and the replay window ends the flood. But a drone that has just started
         has no window yet, and what it hears may be a recording: what names another start of it is not obeyed, and what
-        names none only if it tells it to hold or land, for a pilot must be able to stop a drone that nobody hears.
+        names none only if it tells it to hold or land, for a pilot must be able to stop a drone that nobody hears. So
+        is an order to hold or land that names a later start: whoever told the ground of one must not keep a drone up.
         """
         if sender != GROUND or self._own == GROUND:
             raise InputError("a command that is not from the ground")
@@ -92,7 +93,7 @@ class Orders:
             if command.target == self._own or not command.starts:
                 raise InputError("a command to fly on that does not name the start of the drone that it is for")
             return False
-        if boot is not None and boot != self._boot:
+        if boot is not None and (boot < self._boot or (boot != self._boot and command.action not in SAFE_ACTIONS)):
             return True
         if command.nonce > self.last_nonce:
             self.last_nonce = command.nonce

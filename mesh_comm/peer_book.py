@@ -87,17 +87,25 @@ class PeerBook:
         latest = sorted(self._records.values(), key=lambda record: (-record.heard_at, record.id))[:most]
         return {record.id: round(max(0.0, now - record.heard_at), 3) for record in latest}
 
-    def positions(self, now: float, leave_out: int | None = None) -> NDArray[np.float64]:
+    def positions(self, now: float) -> NDArray[np.float64]:
         """Return where the live peers should be by now, `[n, 2]` metres, own frame; without those of unknown frames."""
-        places = []
-        for record in self.live(now):
-            if record.id == leave_out:
+        return np.array(self.places(now), np.float64).reshape(-1, 2)
+
+    def places(self, now: float, leave_out: int | None = None) -> list[tuple[float, float]]:
+        """Return what `positions` does as a list, without peer `leave_out`."""
+        places: list[tuple[float, float]] = []
+        timeout_s = self._settings.peer_timeout_s
+        for record in self._records.values():
+            if record.id == leave_out or now - record.heard_at > timeout_s:
                 continue
             place, frame = record.position(now), self._frame_of(record.id)
             if place is None or frame is None:
                 continue
-            places.append(place if frame == IDENTITY else transform_points(frame, np.array([place]))[0])
-        return np.array(places, np.float64).reshape(-1, 2)
+            if frame != IDENTITY:
+                x, y = transform_points(frame, np.array([place]))[0].tolist()
+                place = x, y
+            places.append(place)
+        return places
 
     def _placed(self, record: PeerRecord) -> tuple[Pose | None, tuple[float, float]]:
         """Return a peer's pose and velocity in the own frame; None, and standing, where nobody knows its frame."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from imagine.core.errors import InputError
-from imagine.core.evidence import TileKey
+from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import Pose
-from imagine.mesh_comm.codec import unpack_versions
-from imagine.mesh_comm.digest import Held
-from imagine.mesh_comm.messages import Digest, Here, Holding, Status
+from imagine.mesh_comm.codec import tile_code, tile_of, unpack_coded_versions
+from imagine.mesh_comm.messages import Digest, Here, Holding, Status, Tile
 
 _EXTRAPOLATE_S = 1.0  # a last known velocity says little about where a peer is later than this
 
@@ -28,6 +27,13 @@ class Peer(NamedTuple):
     status: Status | None
 
 
+class Told(NamedTuple):
+    """What a peer holds of a source: the number of the start that it is of, and versions by `codec.tile_code`."""
+
+    boot: int
+    versions: dict[int, int]
+
+
 @dataclass
 class PeerRecord:
     """Everything heard from one peer. Times are the listener's, seconds; `holdings` by source."""
@@ -40,16 +46,17 @@ class PeerRecord:
     pose_at: float = -math.inf
     velocity: tuple[float, float] = (0.0, 0.0)
     status: Status | None = None
+    status_stamp: float = -math.inf
     digest_at: float = -math.inf
     digest_stamp: float = -math.inf
-    holdings: dict[int, Held] = field(default_factory=dict)
+    holdings: dict[int, Told] = field(default_factory=dict)
     met: dict[TileKey, int] | None = None
     """The listener's own tile versions when the peer came into reach; None until they are noted."""
 
     def restart(self, boot: int) -> None:
         """Forget what ended with the peer's restart: its clock begins anew and its map is empty."""
         self.boot = boot
-        self.pose_stamp = self.digest_stamp = self.digest_at = -math.inf
+        self.pose_stamp = self.status_stamp = self.digest_stamp = self.digest_at = -math.inf
         self.holdings, self.met = {}, None
 
     def note_pose(self, pose: Pose, stamp: float, now: float) -> None:
@@ -59,8 +66,8 @@ class PeerRecord:
 
     def note_status(self, status: Status, now: float) -> None:
         """Take a status unless a newer one is known."""
-        if self.status is None or status.stamp >= self.status.stamp or self.pose_stamp == -math.inf:
-            self.status, self.velocity = status, status.velocity
+        if status.stamp >= self.status_stamp:
+            self.status, self.status_stamp, self.velocity = status, status.stamp, status.velocity
         self.note_pose(status.pose, status.stamp, now)
 
     def note_here(self, here: Here, now: float) -> None:
@@ -69,8 +76,11 @@ class PeerRecord:
             self.velocity = here.velocity
         self.note_pose(here.pose, here.stamp, now)
 
-    def note_digest(self, digest: Digest, now: float, max_sources: int) -> None:
+    def note_digest(self, digest: Digest, now: float, max_sources: int, grid: EvidenceMap) -> None:
         """Take what the peer says it holds, interval by interval; an older digest than the last is left out.
+
+        Of a source more tiles than `grid` has places are kept only where these are: no others could be sent, and that
+        bounds the memory, whatever a digest claims.
 
         Raises InputError on a damaged list and on more than `max_sources` sources, then with nothing taken.
         """
@@ -82,22 +92,26 @@ class PeerRecord:
         for holding, versions in lists:
             known = self.holdings.get(holding.source)
             if known is None or known.boot != holding.boot:
-                known = Held(holding.boot, {})  # its layer of an earlier start is gone
+                known = Told(holding.boot, {})  # its layer of an earlier start is gone
             if holding.after is not None or holding.until is not None:
-                kept = {key: version for key, version in known.versions.items() if not _covers(holding, key)}
+                low, high = _interval(holding)
+                kept = {code: version for code, version in known.versions.items() if not low < code <= high}
                 versions = kept | versions
-            self.holdings[holding.source] = Held(holding.boot, versions)
+            if len(versions) > grid.tile_rows * grid.tile_columns:
+                versions = {code: version for code, version in versions.items() if _is_on(grid, code)}
+            self.holdings[holding.source] = Told(holding.boot, versions)
         self.digest_stamp, self.digest_at = digest.stamp, now
 
-    def note_held(self, source: int, boot: int, versions: Mapping[TileKey, int]) -> None:
+    def note_held(self, source: int, boot: int, tiles: Iterable[Tile]) -> None:
         """Take it that the peer holds tiles, because it sent them."""
         known = self.holdings.get(source)
         if known is None or known.boot < boot:
-            known = self.holdings[source] = Held(boot, {})
+            known = self.holdings[source] = Told(boot, {})
         if known.boot == boot:
-            for key, version in versions.items():
-                if version > known.versions.get(key, 0):
-                    known.versions[key] = version
+            for tile in tiles:
+                code = tile_code((tile.column, tile.row))
+                if tile.version > known.versions.get(code, 0):
+                    known.versions[code] = tile.version
 
     def holds(self, source: int, boot: int, key: TileKey) -> float:
         """Return the version of a tile of a source's start that the peer is known to hold: 0 for none.
@@ -107,11 +121,13 @@ class PeerRecord:
         known = self.holdings.get(source)
         if known is None or known.boot < boot:
             return 0
-        return known.versions.get(key, 0) if known.boot == boot else math.inf
+        return known.versions.get(tile_code(key), 0) if known.boot == boot else math.inf
 
     def hears(self, other: int, within_s: float) -> bool:
-        """Tell whether the peer, by its last status, heard node `other` within the last seconds."""
-        return self.status is not None and self.status.links.get(other, math.inf) <= within_s
+        """Tell whether the peer, by the last status of its present start, heard node `other` lately."""
+        if self.status is None or self.status_stamp == -math.inf:
+            return False
+        return self.status.links.get(other, math.inf) <= within_s
 
     def position(self, now: float) -> tuple[float, float] | None:
         """Return where the peer should be now, by its last pose and velocity; None if never told."""
@@ -121,14 +137,21 @@ class PeerRecord:
         return self.pose.x + self.velocity[0] * ahead, self.pose.y + self.velocity[1] * ahead
 
 
-def _versions(holding: Holding) -> dict[TileKey, int]:
-    versions = unpack_versions(holding.packed)
-    if holding.after is None and holding.until is None:
-        return versions
-    if not all(_covers(holding, key) for key in versions):
+def _versions(holding: Holding) -> dict[int, int]:
+    versions = unpack_coded_versions(holding.packed)
+    low, high = _interval(holding)
+    if versions and not (low < next(iter(versions)) and next(reversed(versions)) <= high):  # they are in order
         raise InputError(f"mesh digest of source {holding.source} lists tiles outside its own interval")
     return versions
 
 
-def _covers(holding: Holding, key: TileKey) -> bool:
-    return (holding.after is None or key > holding.after) and (holding.until is None or key <= holding.until)
+def _interval(holding: Holding) -> tuple[float, float]:
+    """Return the codes of tiles that a holding speaks for: above the first, up to the second."""
+    low = -math.inf if holding.after is None else tile_code(holding.after)
+    return low, math.inf if holding.until is None else tile_code(holding.until)
+
+
+def _is_on(grid: EvidenceMap, code: int) -> bool:
+    key = tile_of(code)
+    row, column = key.row - grid.corner.row, key.column - grid.corner.column
+    return 0 <= row < grid.tile_rows and 0 <= column < grid.tile_columns

@@ -101,6 +101,11 @@ class Placements:
             self._attempt = None
         if source in self._layout:
             self._tracks[source] = _Track(is_given=True)
+        elif source == self._anchor:  # only of the ground: a peer that has a place lends its frame from now on
+            self._anchor = next((s for s in sorted(self._tracks) if self._evidence.placement(s) is not None), None)
+            self._attempt = None
+            for track in self._tracks.values():  # found in the frame that is gone
+                track.candidate, track.confirmations = None, 0
         if source != self._anchor:
             self._evidence.place(source, self._layout.get(source))
 

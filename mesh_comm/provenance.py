@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -90,6 +91,26 @@ class _Arrivals:
         return _Arrival(int(self.version[row, column]), int(self.via[row, column]), tile_at, stamp, scan_at, sketch_via)
 
 
+@numba.njit(cache=True, nogil=True)
+def _note_scan(  # type: ignore[no-untyped-def]
+    provisional, row, last_row, column, last_column, stamp, now, stamps, scan_at, sketch_via
+):
+    """Note a scan on the provisional ones among the tiles from (row, column) to the last ones, where on the grid."""
+    for i in range(row, min(last_row + 1, provisional.shape[0])):
+        for j in range(column, min(last_column + 1, provisional.shape[1])):
+            if provisional[i, j]:
+                stamps[i, j], scan_at[i, j], sketch_via[i, j] = stamp, now, _NOBODY
+
+
+@numba.njit(cache=True, nogil=True)
+def _note_tiles(entries, taken, column0, row0, via, now, version, vias, tile_at):  # type: ignore[no-untyped-def]
+    """Note the tiles that were taken; the grid's first one is (column0, row0)."""
+    for k in range(len(entries)):
+        if taken[k]:
+            i, j = entries[k, 1] - row0, entries[k, 0] - column0
+            version[i, j], vias[i, j], tile_at[i, j] = entries[k, 2], via, now
+
+
 class Provenance:
     """How every tile of every source came here. One record for each tile of the map's grid, which bounds them."""
 
@@ -118,18 +139,22 @@ class Provenance:
         column = max(0, math.floor((x - reach_m) / side) - corner.column)
         last_row = max(0, math.floor((y + reach_m) / side) - corner.row)
         last_column = max(0, math.floor((x + reach_m) / side) - corner.column)
-        reached = slice(row, last_row + 1), slice(column, last_column + 1)
-        provisional = self._evidence.layers[source].provisional[reached]
         arrivals = self._of(source)
-        np.copyto(arrivals.stamp[reached], stamp, where=provisional)
-        np.copyto(arrivals.scan_at[reached], now, where=provisional)
-        arrivals.sketch_via[reached][provisional] = _NOBODY
+        _note_scan(
+            self._evidence.layers[source].provisional, row, last_row, column, last_column, stamp, now,
+            arrivals.stamp, arrivals.scan_at, arrivals.sketch_via,
+        )  # fmt: skip
 
-    def note_tile(self, source: int, key: TileKey, version: int, via: int, now: float) -> None:
-        """Note a tile that was taken into the map, heard from node `via`."""
+    def note_tiles(
+        self, source: int, entries: NDArray[np.int64], taken: NDArray[np.bool_], via: int, now: float
+    ) -> None:
+        """Note the tiles that were `taken` (bool `[n]`) into the map, heard from node `via`.
+
+        `entries` int64 `[n, 3]`: column, row and version of each tile.
+        """
         arrivals = self._of(source)
-        at = key.row - arrivals.corner.row, key.column - arrivals.corner.column
-        arrivals.version[at], arrivals.via[at], arrivals.tile_at[at] = version, via, now
+        column, row = arrivals.corner
+        _note_tiles(entries, taken, column, row, via, now, arrivals.version, arrivals.via, arrivals.tile_at)
 
     def note_sketch(self, source: int, key: TileKey, via: int, now: float) -> None:
         """Note that node `via` filled in cells of a tile from scans of the source that it heard."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -25,6 +25,21 @@ class Receipt:
     def cells_per_byte(self) -> float:
         """What a byte bought, 0 before any."""
         return self.cells / self.bytes if self.bytes else 0.0
+
+
+def shares(size: int, parts: Sequence[int]) -> list[int]:
+    """Return whole numbers that are as `parts` to each other and sum to `size`: the largest remainders are rounded up.
+
+    Hamilton's method; of equal remainders the earlier is. Where all parts are 0 they count alike.
+    """
+    total = sum(parts)
+    if total == 0:
+        parts, total = [1] * len(parts), len(parts)
+    whole = [size * part // total for part in parts]
+    left = size - sum(whole)
+    for k in sorted(range(len(parts)), key=lambda k: -(size * parts[k] % total))[:left]:
+        whole[k] += 1
+    return whole
 
 
 class _Open(NamedTuple):

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine.core.errors import InputError
 from imagine.core.evidence import EvidenceMap
 from imagine.core.frames import Pose
 from imagine.core.lidar import LidarSpec, Scan
-from imagine.core.peer_marks import mask_targets
-from imagine.core.raster import CELL, TILE
+from imagine.core.raster import CELL, beam_directions, ray_table
 from imagine.mesh_comm import messages
-from imagine.mesh_comm.codec import pack_ranges, unpack_ranges
+from imagine.mesh_comm.codec import SCAN_CHANCES, code_metres, pack_ranges
+from imagine.mesh_comm.known_cells import NOBODY_COUNTS, KnownCells
+from imagine.mesh_comm.scan_arrival import DAMAGED, draw_packed_scan
 
 _SCAN_BYTES = 80  # a scan message beside its packed ranges
 
@@ -36,32 +37,34 @@ def scan_message(
 
 
 def draw_peer_scan(
-    evidence: EvidenceMap, message: messages.Scan, teammates: NDArray[np.float64], mask_radius_m: float
-) -> None:
+    evidence: EvidenceMap,
+    message: messages.Scan,
+    teammates: NDArray[np.float64],
+    mask_radius_m: float,
+    known: KnownCells | None = None,
+) -> int:
     """Draw a peer's scan into its layer, except on tiles that already contain it and on teammates `[n, 2]` (metres).
 
-    Raises InputError on damaged ranges and on a pose whose surroundings no map can hold.
+    Returns how many cells of `known` that makes known, 0 without. Raises InputError on damaged ranges, on a pose whose
+    surroundings no map can hold, and on the drone's own id.
     """
-    cap = message.range_cap_m
-    ranges = unpack_ranges(message.packed, message.beams, cap)
-    pose = message.pose
-    reach = cap + 2 * CELL
-    evidence.cover(pose.x - reach, pose.y - reach, pose.x + reach, pose.y + reach)
-    layer = evidence.layer(message.sender)
-    corner, side = evidence.corner, CELL * TILE
-    row0, row1 = math.floor((pose.y - reach) / side) - corner.row, math.floor((pose.y + reach) / side) - corner.row
-    column0, column1 = (
-        math.floor((pose.x - reach) / side) - corner.column, math.floor((pose.x + reach) / side) - corner.column,
+    sender, pose, beams, cap = message.sender, message.pose, message.beams, message.range_cap_m
+    if sender == evidence.own:
+        raise InputError(f"source {sender} is this drone itself: its scans are not a peer's")
+    reach_m = cap + 2 * CELL
+    evidence.cover(pose.x - reach_m, pose.y - reach_m, pose.x + reach_m, pose.y + reach_m)
+    layer = evidence.layer(sender)
+    column0, row0 = evidence.origin_cells
+    increment = min(message.increment * beams, 2.0 * math.pi) / beams
+    table = ray_table(cap)
+    is_known = NOBODY_COUNTS if known is None else known.not_yet(sender)
+    found = np.empty(table.sheet[0] * table.width, np.int32)
+    count = draw_packed_scan(
+        np.frombuffer(message.packed, np.uint8), SCAN_CHANCES, code_metres(cap), beams,
+        pose.x, pose.y, pose.yaw, message.start, increment, beam_directions(message.start, increment, beams), cap,
+        table.reach, table.width, table.starts, table.offsets, teammates, mask_radius_m,
+        layer.cells, layer.versions, layer.provisional, message.clock, row0, column0, is_known, found,
     )  # fmt: skip
-    if layer.versions[row0 : row1 + 1, column0 : column1 + 1].min() >= message.clock:
-        return  # every tile in reach contains this scan
-    spec = _sensor(message.beams, message.increment, message.start, cap)
-    if len(teammates):
-        ranges = mask_targets(ranges, spec.start, spec.increment, spec.range_max, pose, teammates, mask_radius_m)
-    evidence.integrate_provisional(message.sender, pose, Scan(message.stamp, ranges), spec, cap, message.clock)
-
-
-@lru_cache(maxsize=64)
-def _sensor(beams: int, increment: float, start: float, range_cap_m: float) -> LidarSpec:
-    fov = min(increment * beams, 2.0 * math.pi)
-    return LidarSpec(beams, fov, range_min=0.0, range_max=range_cap_m + 1.0, start=start)
+    if count == DAMAGED:
+        raise InputError(f"mesh scan: {len(message.packed)} bytes do not tell {beams} ranges up to {cap} m")
+    return 0 if known is None else known.claim_found(found, count)

@@ -18,11 +18,12 @@ from imagine.mesh_comm.messages import GROUND, MAX_DATAGRAM, Digest, Here, Messa
 from imagine.mesh_comm.node_state import NodeState
 from imagine.mesh_comm.receipts import Bought
 from imagine.mesh_comm.scan_exchange import scan_message
-from imagine.mesh_comm.tile_exchange import Wanted
+from imagine.mesh_comm.wanted import Wanted
 
 _PLAN_PERIOD_S = 0.2
 _DIGEST_DATAGRAMS = 4  # of a longer digest, this many go out per period, in turn
 _DIGEST_SHARE, _MOST_DIGEST_S = 0.125, 1.5  # where bytes are short, digests take so much of them, or come so late
+_MOST_DIGEST_SHARE = 0.5  # but never more than this: digests of a large team would leave nothing for maps
 _STATUS_SHARE, _MOST_STATUS_S = 0.125, 2.0  # so do statuses
 _HERE_SHARE, _MOST_HERE_S = 0.2, 1.0  # and poses between them, well within a peer's timeout
 _SCANS_BEFORE_NEWS, _SCANS_BEFORE_REPEATS = 1, 4  # where bytes are short, so many scans go before a message of tiles
@@ -204,7 +205,10 @@ class Speaking:
                 return False
             self._digests.popleft()
             self._digest_bytes += len(out[-1])
-            spread_s = self._spread_s(self._digest_bytes, _DIGEST_SHARE, _MOST_DIGEST_S)
+            spread_s = max(
+                self._spread_s(self._digest_bytes, _DIGEST_SHARE, _MOST_DIGEST_S),
+                self._spread_s(self._digest_bytes, _MOST_DIGEST_SHARE, np.inf),
+            )
             self._next_digest = max(self._next_digest, self._digest_at + spread_s)
         return True
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import IDENTITY
@@ -22,8 +21,9 @@ from imagine.mesh_comm.information import (
 )
 from imagine.mesh_comm.messages import GROUND, Sketch, Tile, Tiles, tile_key
 from imagine.mesh_comm.peers import PeerRecord
-from imagine.mesh_comm.receipts import Receipts
+from imagine.mesh_comm.receipts import Receipts, shares
 from imagine.mesh_comm.settings import MeshSettings
+from imagine.mesh_comm.wanted import Wanted
 
 _TILE_BYTES = 16  # a tile beside its packed cells: place, version and lengths, at their longest
 _TILES_BYTES = 15
@@ -48,27 +48,6 @@ class _Sent(NamedTuple):
     known: int
 
 
-class Wanted(NamedTuple):
-    """A tile that peers lack, since when; `told`: the cells it would tell each of them, `worth` so much in all.
-
-    `is_sketch`: it goes out as it is drawn here, with scans that its source confirms no more.
-    """
-
-    rank: tuple[float, ...]
-    source: int
-    key: TileKey
-    since: float
-    told: dict[int, int]
-    worth: int
-    known: int
-    is_sketch: bool = False
-
-    @property
-    def brings_news(self) -> bool:
-        """Whether it tells some peer a cell that it does not know, as far as is known here."""
-        return self.worth > 0
-
-
 class TileExchange:
     """The tiles a node can give to others, and the queue of those that others lack."""
 
@@ -90,17 +69,12 @@ class TileExchange:
         """The tile that goes out next, if any is wanted."""
         return self._queue[0] if self._queue else None
 
-    def merge(self, source: int, tile: Tile, cells: NDArray[np.int8]) -> bool:
-        """Take a tile heard from a peer if it is newer than what is held; tell whether it was taken.
-
-        `cells` int8 `[TILE, TILE]`, unpacked from the tile. Raises InputError on a tile too far away to hold.
-        """
-        key = tile_key(tile)
-        if not self._evidence.merge_tile(source, key, tile.version, cells):
-            return False
+    def confirm(self, source: int, tiles: Iterable[Tile]) -> None:
+        """Take it that the newest of a source's tiles that are held are these, as the source confirmed them."""
         # kept apart from the layer: scans drawn ahead of the next version must not be passed on
-        self._confirmed.setdefault(source, {})[key] = Content(tile.version, tile.packed)
-        return True
+        confirmed = self._confirmed.setdefault(source, {})
+        for tile in tiles:
+            confirmed[tile_key(tile)] = Content(tile.version, tile.packed)
 
     def forget(self, source: int) -> None:
         """Drop the tiles of a source that has started anew."""
@@ -109,12 +83,21 @@ class TileExchange:
         self._sketched = {of: known for of, known in self._sketched.items() if of[1] != source}
         self._queue = [wanted for wanted in self._queue if wanted.source != source]
 
-    def note_overheard(self, source: int, tile: Tile, now: float) -> None:
-        """Take it that those in reach have a tile another node just sent: no need to pass it on at once."""
-        key = tile_key(tile)
-        held = self._confirmed.get(source, {}).get(key)
-        if held is None or held.version <= tile.version:
-            self._sent[source, key] = _Sent(tile.version, now, self._known(source, key))
+    def note_met(self, peer: int) -> None:
+        """Take it that a peer came into reach, or started anew: what it was sketched before may be gone."""
+        self._sketched = {of: known for of, known in self._sketched.items() if of[0] != peer}
+
+    def note_overheard(self, source: int, tiles: Sequence[Tile], known: Sequence[int], now: float) -> None:
+        """Take it that those in reach have what another node just sent: no need to pass it on at once.
+
+        `known`: how many cells have evidence on each of the tiles, as they are held here.
+        """
+        confirmed = self._confirmed.get(source, {})
+        for tile, cells in zip(tiles, known, strict=True):
+            key = tile_key(tile)
+            held = confirmed.get(key)
+            if held is None or held.version <= tile.version:
+                self._sent[source, key] = _Sent(tile.version, now, cells)
 
     def plan(self, peers: Sequence[PeerRecord], now: float) -> None:
         """Make the queue anew: tiles that some of `peers`, by their digests, lack and that may be sent at `now`.
@@ -177,7 +160,7 @@ class TileExchange:
     def note_sent(self, message: Tiles | Sketch, size: int, now: float) -> None:
         """Take the tiles of a message that went out, in `size` sealed bytes, off the queue."""
         gone = {tile_key(tile): tile for tile in message.tiles}
-        packed = max(1, sum(len(tile.packed) for tile in message.tiles))
+        share = dict(zip(gone, shares(size, [len(tile.packed) for tile in message.tiles]), strict=True))
         left: list[Wanted] = []
         for wanted in self._queue:
             is_of = wanted.source == message.source and wanted.is_sketch == isinstance(message, Sketch)
@@ -187,14 +170,13 @@ class TileExchange:
                 continue
             if wanted.is_sketch:
                 self._sketched |= {(peer, wanted.source, wanted.key): wanted.known for peer in wanted.told}
-                self.receipts.note_sketch(round(size * len(tile.packed) / packed), wanted.told)
+                self.receipts.note_sketch(share[wanted.key], wanted.told)
                 continue
             self._sent[message.source, wanted.key] = _Sent(tile.version, now, wanted.known)
             self._since.pop((wanted.source, wanted.key), None)
-            share = round(size * len(tile.packed) / packed)
             self.receipts.note_tile(
-                message.source, message.boot, wanted.key, tile.version, share, wanted.told, now
-            )  # fmt: skip
+                message.source, message.boot, wanted.key, tile.version, share[wanted.key], wanted.told, now
+            )
         self._queue = left
 
     def _sketches(self, peers: Sequence[PeerRecord], now: float) -> list[Wanted]:

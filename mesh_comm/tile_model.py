@@ -148,6 +148,20 @@ def decode_tile(data, zeros, cells):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def decode_tiles(data, ends, zeros, cells):  # type: ignore[no-untyped-def]
+    """Read `cells` (int8 `[n, TILE, TILE]`), tile k from the bytes of `data` before `ends[k]` (int64 `[n]`).
+
+    Return how many tiles are sound before the first that is not, which ends it.
+    """
+    first = np.int64(0)
+    for k in range(len(ends)):
+        if not decode_tile(data[first : ends[k]], zeros, cells[k]):
+            return k
+        first = ends[k]
+    return len(ends)
+
+
+@numba.njit(cache=True, nogil=True)
 def _decode_other(data, state, zeros, west, w, n, ne):  # type: ignore[no-untyped-def]
     """Return a cell that differs from W, and the state after it."""
     pair = w * CLASSES + n

@@ -23,6 +23,9 @@ from imagine.mesh_comm.range_coder import (
 
 BIAS = MAX_TILES + 1
 """What is added to columns, so that the first is above 0."""
+KEY_BIAS, KEY_SPAN = MAX_TILES, 2 * MAX_TILES + 1
+"""A tile's code is (column + KEY_BIAS) KEY_SPAN + row + KEY_BIAS, from 0 on: codes are in order where keys are."""
+DAMAGED, OVERLONG = -1, -2
 MOST_LISTED = 4096
 """No list holds more tiles."""
 TILES_A_BYTE = 64
@@ -68,23 +71,19 @@ def version_steps(entries, steps):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def decode_count(data, zeros):  # type: ignore[no-untyped-def]
-    """Begin to read a list from `data` (uint8); return how many tiles it claims to hold, and the decoder's state.
+def decode_versions(data, codes, versions):  # type: ignore[no-untyped-def]
+    """Read a list from `data` (uint8) into `codes` and `versions` (int64); return how many tiles it tells.
 
-    `zeros` int64 `[VERSION_CONTEXTS]` become even odds, and learn.
+    Sorted by code, see `KEY_BIAS`. OVERLONG where it claims to tell more than there is room for; DAMAGED where it is
+    not sorted, out of bounds, or has more behind it than zeros.
     """
+    zeros = np.empty(VERSION_CONTEXTS, np.int64)
     zeros[:] = ONE // 2
-    return decode_number(data, start_decoder(data), zeros, _COUNT)
-
-
-@numba.njit(cache=True, nogil=True)
-def decode_entries(data, zeros, state, entries):  # type: ignore[no-untyped-def]
-    """Read `entries` (int64 `[count, 3]`) behind the count; return whether they are sorted, in bounds, and the last.
-
-    `zeros` and `state` as `decode_count` left them.
-    """
+    count, state = decode_number(data, start_decoder(data), zeros, _COUNT)
+    if count > len(codes):
+        return np.int64(OVERLONG)
     column, row, first_row, version = -BIAS, np.int64(0), np.int64(0), np.int64(0)
-    for k in range(len(entries)):
+    for k in range(count):
         column_step, state = decode_number(data, state, zeros, _COLUMN)
         before = row
         if column_step > 0:
@@ -95,11 +94,11 @@ def decode_entries(data, zeros, state, entries):  # type: ignore[no-untyped-def]
             step, state = decode_number(data, state, zeros, _ROW_AFTER)
             row += _unzigzag(step)
             if k > 0 and row <= before:
-                return False
+                return np.int64(DAMAGED)
         column += column_step
         step, state = decode_number(data, state, zeros, _VERSION)
         version += _unzigzag(step)
         if abs(column) > MAX_TILES or abs(row) > MAX_TILES or version < 0 or version >= 1 << 32:
-            return False
-        entries[k, 0], entries[k, 1], entries[k, 2] = column, row, version
-    return has_only_zeros_left(data, state)
+            return np.int64(DAMAGED)
+        codes[k], versions[k] = (column + KEY_BIAS) * KEY_SPAN + row + KEY_BIAS, version
+    return count if has_only_zeros_left(data, state) else np.int64(DAMAGED)

@@ -46,6 +46,12 @@ def test_a_new_key_is_private_readable_back_and_never_overwritten(tmp_path: Path
         write_new_keys(tmp_path / "absent" / "swarm.key")
 
 
+def test_one_file_for_drones_and_ground_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="another file"):
+        write_new_keys(tmp_path / "swarm.key", tmp_path / "swarm.key")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o602, 0o644])
 def test_a_key_file_that_others_can_touch_is_refused_with_the_remedy(tmp_path: Path, mode: int) -> None:
     path = tmp_path / "swarm.key"

@@ -10,8 +10,10 @@ from frames_room import FLAT, SQUARE, Stranger, share
 from numpy.typing import NDArray
 from radio_room import Drone, exchange, make_drone, same_layers
 
+from imagine.core.evidence import EvidenceMap
 from imagine.core.frames import IDENTITY, Pose, compose, inverse, relative, transform_points, wrap_angle
 from imagine.core.raster import CELL
+from imagine.mesh_comm.placement import Placements
 from imagine.mesh_comm.settings import MeshSettings
 
 FRAMES = {1: Pose(0.5, 0.7, 0.4), 2: Pose(7.3, 2.2, -2.1)}
@@ -124,10 +126,46 @@ def test_a_shared_frame_is_the_identity() -> None:
     assert inverse(IDENTITY) == IDENTITY
 
 
+def test_news_of_a_restart_by_a_relay_ends_a_place_as_the_restarted_drone_itself_does() -> None:
+    listening, relay = (make_drone(i, protocol="multi-hop", frame="unknown") for i in (1, 3))
+    first, again = (make_drone(2, boot, protocol="multi-hop", frame="unknown") for boot in (1, 2))
+    now = 0.0
+    for life in (first, again):
+        life.fly(Pose(0.0, 0.0, 0.0), now)
+        relay.fly(Pose(1.0, 0.0, 0.0), now)
+        exchange([life, relay], np.array([now + 0.1 * tick for tick in range(30)]))
+        exchange([relay, listening], np.array([now + 3.0 + 0.1 * tick for tick in range(30)]))
+        assert listening.evidence.layers[2].boot == life.evidence.layers[2].boot
+        if life is first:
+            listening.evidence.place(2, Pose(1.0, 2.0, 0.5))
+        now += 10.0
+    assert listening.node.place(2).pose is None
+    exchange([again, listening], np.array([now + 0.1 * tick for tick in range(5)]))
+    assert listening.node.place(2).pose is None
+
+
 @pytest.mark.parametrize("settings", [{"frame": "layout"}, {"layout": {1: (0.0, 0.0, 0.0)}}])
 def test_a_layout_and_its_frame_go_together(settings: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="layout"):
         MeshSettings.model_validate(settings)
+
+
+def test_when_the_drone_that_lends_the_ground_its_frame_restarts_the_others_stay_where_they_are_shown() -> None:
+    evidence = EvidenceMap(0, shares_frame=False)
+    places = Placements(evidence, MeshSettings(frame="unknown").alignment)
+    for source in (1, 2):
+        evidence.layer(source).cells[:16, :16] = 8
+    assert places.advance(0.0) == [1]
+    shown = Pose(3.0, 1.0, 0.5)
+    evidence.place(2, shown)
+    places.forget(1)
+    assert places.place(1).pose is None
+    assert places.place(2).pose == shown
+    evidence.place(2, None)
+    places.forget(2)
+    places.forget(1)
+    assert places.advance(100.0) == [1]  # nobody has a place: the next one heard lends its frame
+    assert places.place(1).pose == IDENTITY
 
 
 def test_the_ground_shows_all_in_the_frame_of_the_first_drone_it_hears() -> None:

@@ -16,7 +16,7 @@ from imagine.core.evidence import EvidenceMap, TileKey
 from imagine.core.frames import Pose
 from imagine.core.lidar import Scan
 from imagine.mesh_comm import messages
-from imagine.mesh_comm.codec import pack_tile, unpack_ranges
+from imagine.mesh_comm.codec import pack_tile, pack_versions, unpack_ranges
 from imagine.mesh_comm.messages import MAX_DATAGRAM, Digest, Status, Tile, Tiles
 from imagine.mesh_comm.node import MeshNode, MeshSettings
 from imagine.mesh_comm.orders import Orders
@@ -170,6 +170,17 @@ def test_what_a_source_told_before_it_left_is_passed_on_until_the_source_confirm
     assert same_layers([a, b, c])
 
 
+def test_a_drone_that_restarts_within_a_moment_is_told_again_what_is_left_of_a_source() -> None:
+    _, b, c = drawn_by_a_source_that_left()
+    exchange([b, c], ticks(6.0, 4.0))
+    again = make_drone(3, boot=2, protocol="multi-hop")
+    again.fly(Pose(-3.0, -1.0, 0.0), 10.0)
+    exchange([b, again], ticks(10.0, 4.0))
+    assert c.evidence.layers[1].provisional.any()
+    for key in (TileKey(column, row) for column in range(-6, 6) for row in range(-6, 6)):
+        np.testing.assert_array_equal(again.evidence.tile(1, key), c.evidence.tile(1, key))
+
+
 def test_a_sketch_tells_nothing_to_who_holds_a_later_version_or_hears_the_source() -> None:
     a = drawn_by_a_source_that_left()[0]
     d = make_drone(4, protocol="multi-hop")
@@ -262,6 +273,23 @@ def test_a_tight_budget_starves_neither_scans_nor_tiles() -> None:
         exchange([a, b], np.array([now]))
     assert a.node.bytes_sent["scan"] > 2000
     assert a.node.bytes_sent["tile"] > 2000
+
+
+def test_digests_of_a_large_team_leave_bytes_for_maps_at_a_very_low_rate() -> None:
+    a, b = (make_drone(i, protocol="multi-hop", rate_bytes_per_s=833.0, burst_bytes=1200.0) for i in (1, 2))
+    rng = np.random.default_rng(3)
+    cells = np.full((32, 32), -8, np.int8)
+    for source in range(3, 17):
+        tiles = [Tile(i % 8 - 4, i // 8 - 2, int(rng.integers(1, 900)), pack_tile(cells)) for i in range(40)]
+        a.node.receive(Sealer(KEY, source, 1).seal(messages.encode(Tiles(source, tiles, 1)), 0.0), 0.0)
+    for now in ticks(0.0, 40.0):
+        a.fly(Pose(0.02 * float(now), 0.0, 0.0), float(now))
+        b.fly(Pose(0.0, 1.0, 0.0), float(now))
+        exchange([a, b], np.array([now]))
+    sent = a.node.bytes_sent
+    assert sent["digest"] < 0.6 * sum(sent.values())
+    assert sent["scan"] + sent["tile"] > 0.15 * sum(sent.values())
+    assert b.evidence.versions(1)
 
 
 def test_a_scan_of_many_beams_still_fits_a_datagram() -> None:
@@ -475,6 +503,20 @@ def test_recorded_orders_do_nothing_to_a_drone_that_has_just_started(target: int
     assert [c.action for c in again.node.commands()] == ["hold"]
 
 
+def test_whoever_tells_the_ground_of_a_start_that_never_was_cannot_keep_a_drone_from_landing() -> None:
+    ground, drone = make_drone(0), make_drone(1, boot=5)
+    drone.node.set_status(Status(1, 0.0, Pose(0.0, 0.0, 0.0)))
+    exchange([ground, drone], ticks(0.0, 0.3))
+    lie = Digest(0.0, [messages.Holding(1, None, None, pack_versions({}), 2**32 - 1)])
+    ground.node.receive(Sealer(KEY, 9, 1).seal(messages.encode(lie), 0.3), 0.3)
+    for now, action in ((0.4, "resume"), (1.4, "land")):
+        ground.node.send_command(action, 1, now)
+        (order,) = carrying(ground.poll(now), messages.Command)
+        drone.node.receive(order, now)
+    assert [command.action for command in drone.node.commands()] == ["land"]
+    assert drone.node.stats == {"old-life": 1}
+
+
 def test_an_order_to_fly_on_is_refused_without_the_drones_name_and_passed_over_where_it_names_others() -> None:
     drone = make_drone(2)
     for number, order in enumerate((
@@ -543,6 +585,22 @@ def test_a_restarted_drone_is_heard_again_and_its_map_replaces_the_old_one() -> 
         b.node.receive(recording, 9.0)
     assert b.evidence.versions(1) == held
     assert b.node.stats["old-boot"] == len(a.sent)
+
+
+def test_a_restarted_drones_status_counts_although_its_clock_began_anew_and_a_pose_came_first() -> None:
+    listening = make_drone(1)
+    here = Pose(0.0, 0.0, 0.0)
+    said = [
+        (1, Status(2, 300.0, here, battery=0.2, links={3: 0.1})),
+        (2, messages.Here(2, 1.0, here, (0.0, 0.0))),
+        (2, Status(2, 1.5, here, battery=0.9)),
+    ]
+    for counter, (boot, message) in enumerate(said, start=1):
+        sealer = Sealer(KEY, 2, boot, first_counter=counter)
+        listening.node.receive(sealer.seal(messages.encode(message), 0.0), 0.0)
+    status = listening.node.peers(0.0)[2].status
+    assert status is not None
+    assert status.battery == 0.9
 
 
 def listener() -> Drone:
