@@ -23,11 +23,11 @@ from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.level import Level
 from imagine.train.pilots import Actions
 
-_SHARE = 0.92
+_SHARE = 0.91
 """Of the cells, planned for: what is timed, and a little more, for from the lattice more is seen than drones see."""
 _EVERY_CELL = 2
 _NEAR_FACTOR = 1.5
-_SEARCHES, _SEARCH_TRIES, _SEARCH_HEAT = 12, 30_000, 12.0  # from a level's own launch point, at its first launches
+_SEARCHES, _SEARCH_TRIES, _SEARCH_HEAT = 12, 60_000, 12.0  # from a level's own launch point, at its first launches
 _FIRST_TRIES, _FIRST_HEAT = 6000, 12.0  # from elsewhere, once an episode
 _TRIES, _HEAT = 60, 0.3  # at every decision
 _PER_METRE = 0.02  # ticks: of plans that are equally quick the shorter one is meant
