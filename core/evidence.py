@@ -77,7 +77,8 @@ class EvidenceMap:
         known but the own.
 
         It grows to at most `max_extent_m` along an axis: a bound on memory, and on the time a tick takes, whatever
-        peers send. Raises InputError if that is less than is reserved, or more than 512 m.
+        peers send. What they send makes it grow to half of that at most, each way from `begin_at`, so that there is
+        always room for the drone's own scans. Raises InputError if that is less than is reserved, or more than 512 m.
         """
         tiles = max(1, math.ceil(half_extent_m / (CELL * TILE)))
         self._max_tiles = math.floor(max_extent_m / (CELL * TILE) + 1e-9)
@@ -87,6 +88,7 @@ class EvidenceMap:
                 f"needs to hold what is reserved, and be at most {MAX_TILES * CELL * TILE:.0f} m"
             )
         self.own = own
+        self._home = TileKey(0, 0)
         self.corner = TileKey(-tiles, -tiles)
         self.tile_rows = self.tile_columns = 2 * tiles
         self.layers: dict[int, Layer] = {own: Layer.empty(self.tile_rows, self.tile_columns)}
@@ -213,7 +215,7 @@ class EvidenceMap:
             raise InputError(f"a tile is int8 {TILE}x{TILE}, got {cells.dtype} {cells.shape}")
         if not 1 <= version < 2**32:
             raise InputError(f"tile {tuple(key)} of source {source}: version {version} is out of range")
-        self.cover_tiles(key.column, key.row, key.column, key.row)
+        self.cover_tiles(key.column, key.row, key.column, key.row, of_peer=True)
         layer = self.layer(source)
         row, column = key.row - self.corner.row, key.column - self.corner.column
         taken = write_tile(layer.cells, layer.versions, layer.provisional, row, column, version, cells)
@@ -233,7 +235,7 @@ class EvidenceMap:
             raise InputError(f"a sketch of source {source} came from outside, but only drone {source} writes it")
         if cells.shape != (TILE, TILE) or cells.dtype != np.int8 or cells.max() > LIMIT or cells.min() < -LIMIT:
             raise InputError(f"sketch {tuple(key)} of source {source} is no int8 {TILE}x{TILE} tile within its bounds")
-        self.cover_tiles(key.column, key.row, key.column, key.row)
+        self.cover_tiles(key.column, key.row, key.column, key.row, of_peer=True)
         layer = self.layer(source)
         row, column = key.row - self.corner.row, key.column - self.corner.column
         held = self.tile(source, key)
@@ -282,7 +284,7 @@ class EvidenceMap:
             extent = placed.extent(self.layers[source].cells, self.origin_cells)
             if extent is not None:
                 with suppress(InputError):  # far away: what fits is drawn
-                    self.cover(*extent)
+                    self.cover(*extent, of_peer=True)
         if stale:  # the grid may have grown under all of them
             for source, placed in self._placed.items():
                 if source in self.layers:
@@ -305,14 +307,21 @@ class EvidenceMap:
         sum_layers(np.stack(layers), out)
         return out
 
-    def cover(self, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
-        """Grow the grid to hold a rectangle of the map frame, metres; raise InputError past the largest extent."""
-        side = CELL * TILE
-        self.cover_tiles(
-            math.floor(x_min / side), math.floor(y_min / side), math.floor(x_max / side), math.floor(y_max / side)
-        )
+    def begin_at(self, x: float, y: float) -> None:
+        """Take it that the drone begins at (x, y), metres: there is to be room around it. Raises InputError."""
+        self.cover(x, y, x, y)
+        self._home = TileKey(math.floor(x / (CELL * TILE)), math.floor(y / (CELL * TILE)))
 
-    def cover_tiles(self, column_min: int, row_min: int, column_max: int, row_max: int) -> None:
+    def cover(self, x_min: float, y_min: float, x_max: float, y_max: float, of_peer: bool = False) -> None:
+        """Grow the grid to hold a rectangle of the map frame, metres.
+
+        Raises InputError past the largest extent, and for what is `of_peer` past what peers may take up.
+        """
+        side = CELL * TILE
+        column_min, row_min = math.floor(x_min / side), math.floor(y_min / side)
+        self.cover_tiles(column_min, row_min, math.floor(x_max / side), math.floor(y_max / side), of_peer)
+
+    def cover_tiles(self, column_min: int, row_min: int, column_max: int, row_max: int, of_peer: bool = False) -> None:
         """Grow the grid to hold tiles from the least column and row to the greatest; raise InputError as `cover`."""
         column, row = self.corner
         if (
@@ -322,6 +331,15 @@ class EvidenceMap:
             and row_max < row + self.tile_rows
         ):
             return
+        half, home = self._max_tiles // 2, self._home
+        if of_peer and (
+            min(column_min - home.column, row_min - home.row) < -half
+            or max(column_max - home.column, row_max - home.row) >= half
+        ):
+            raise InputError(
+                f"a peer's tiles, columns {column_min} to {column_max} and rows {row_min} to {row_max}, lie far "
+                f"outside: more than {half * CELL * TILE:.0f} m from where this drone began"
+            )
         low = TileKey(min(column_min, column), min(row_min, row))
         high_column = max(column_max + 1, self.corner.column + self.tile_columns)
         high_row = max(row_max + 1, self.corner.row + self.tile_rows)

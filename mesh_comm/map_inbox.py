@@ -107,7 +107,7 @@ class MapInbox:
 
     def _cover(self, tiles: Sequence[Tile]) -> None:
         columns, rows = [tile.column for tile in tiles], [tile.row for tile in tiles]
-        self._evidence.cover_tiles(min(columns), min(rows), max(columns), max(rows))
+        self._evidence.cover_tiles(min(columns), min(rows), max(columns), max(rows), of_peer=True)
 
     def _within_reach(self, tiles: list[Tile]) -> list[Tile]:
         """Return the tiles before the first that no map can hold beside those before it; the grid grows for them."""

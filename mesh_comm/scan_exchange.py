@@ -52,7 +52,7 @@ def draw_peer_scan(
     if sender == evidence.own:
         raise InputError(f"source {sender} is this drone itself: its scans are not a peer's")
     reach_m = cap + 2 * CELL
-    evidence.cover(pose.x - reach_m, pose.y - reach_m, pose.x + reach_m, pose.y + reach_m)
+    evidence.cover(pose.x - reach_m, pose.y - reach_m, pose.x + reach_m, pose.y + reach_m, of_peer=True)
     layer = evidence.layer(sender)
     column0, row0 = evidence.origin_cells
     increment = min(message.increment * beams, 2.0 * math.pi) / beams

@@ -34,7 +34,7 @@ def build_runner(settings: DroneSettings, policy: Policy | None, sealer: Sealer 
     """Return a runner at its launch pose, with an empty map; `sealer` None leaves it without mesh."""
     evidence = EvidenceMap(settings.drone_id)
     launch = settings.launch.pose
-    evidence.cover(launch.x, launch.y, launch.x, launch.y)
+    evidence.begin_at(launch.x, launch.y)
     mesh = None
     if sealer is not None:
         mesh = MeshNode(evidence, settings.lidar_spec, settings.map.range_cap_m, settings.radio, sealer)

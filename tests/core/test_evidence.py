@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -281,3 +282,21 @@ def test_what_was_never_seen_reads_as_nothing() -> None:
     assert evidence.versions(7) == {}
     assert not evidence.is_provisional(7, TileKey(0, 0))
     assert not evidence.is_provisional(1, TileKey(10_000, 0))
+
+
+@pytest.mark.parametrize("begin", [(0.0, 0.0), (30.0, -8.0)])
+def test_whatever_peers_send_there_is_room_for_own_scans_within_half_the_largest_extent(
+    begin: tuple[float, float],
+) -> None:
+    evidence = EvidenceMap(1)
+    evidence.begin_at(*begin)
+    tile = np.full((TILE, TILE), -4, np.int8)
+    home = math.floor(begin[0] / 3.2), math.floor(begin[1] / 3.2)
+    for far in (TileKey(home[0] - 21, home[1]), TileKey(home[0], home[1] + 20), TileKey(-10_000, 0)):
+        with pytest.raises(InputError, match="from where this drone began"):
+            evidence.merge_tile(2, far, 1, tile)
+    for column, row in itertools.product((-20, 19), (-20, 19)):
+        assert evidence.merge_tile(2, TileKey(home[0] + column, home[1] + row), 1, tile)
+    scan = Scan(0.0, np.full(LIDAR.beams, 3.0, np.float32))
+    for x, y in itertools.product((-55.0, 55.0), (-55.0, 55.0)):
+        evidence.integrate(Pose(begin[0] + x, begin[1] + y, 0.0), scan, LIDAR, CAP_M)

@@ -151,8 +151,8 @@ def bootstrap_interval(
 
     `sizes` are those of the levels that the values belong to, one after another (None: a single one). The mean is then
     `level_mean`, and each level is resampled for itself (Davison and Hinkley 1997, section 3.2): what differs between
-    levels is no matter of chance, for they were chosen. With one episode a level, as of many floor plans, the levels are
-    the sample, and are resampled.
+    levels is no matter of chance, for they were chosen.
+    With one episode a level, as of many floor plans, levels are the sample, and are resampled.
     """
     return _interval(sizes or [len(values)], lambda drawn: values[drawn].mean(axis=1), lambda mean: mean, rng)
 
