@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
 import time
 from pathlib import Path
@@ -12,16 +11,15 @@ from typing import Any
 
 import pytest
 from command_line import POLICY, Running
+from headless import ARGUMENTS, CHROMIUM, NEEDS_CHROMIUM
 
 pytest.importorskip("uvicorn", reason="the gcs extra is not installed")
 api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 expect = api.expect
 
-CHROMIUM = os.environ.get("IMAGINE_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
-    pytest.mark.browser,
+    *NEEDS_CHROMIUM,
     pytest.mark.sitl,
-    pytest.mark.skipif(not CHROMIUM, reason="no chromium on PATH; set IMAGINE_CHROMIUM to one"),
     pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds runners in /proc"),
 ]
 DEADLINE_S = 60.0
@@ -41,7 +39,7 @@ def wait(page: Any, condition: str) -> dict[str, Any]:
 def test_a_flight_on_the_page() -> None:
     command = ["fly", "--sim", "--level", "4", "--drones", "3", "--ticks", "600", "--port", "0", *POLICY]
     with api.sync_playwright() as playwright, Running(*command) as flight:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(DEADLINE_S * 1000)
         problems: list[str] = []

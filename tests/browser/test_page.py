@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from headless import DEADLINE_MS, NEEDS_CHROMIUM, opened_page
 from small_swarm import Swarm
 
 from imagine.gcs.server import GroundServer
@@ -18,31 +17,8 @@ pytest.importorskip("uvicorn", reason="the gcs extra is not installed")
 api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 expect = api.expect
 
-CHROMIUM = os.environ.get("IMAGINE_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(not CHROMIUM, reason="no chromium on PATH; set IMAGINE_CHROMIUM to one"),
-]
-ARGUMENTS = [
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
-]  # fmt: skip
-DEADLINE_MS = 10_000
+pytestmark = NEEDS_CHROMIUM
 WALL, FREE = [216, 226, 235], [49, 66, 84]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with api.sync_playwright() as playwright:
-        running = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield running
-        running.close()
-
-
-@pytest.fixture
-def server() -> Iterator[GroundServer]:
-    with GroundServer(port=0) as running:
-        yield running
 
 
 @pytest.fixture
@@ -55,18 +31,10 @@ def swarm(server: GroundServer) -> Swarm:
 @pytest.fixture
 def page(browser: Any, server: GroundServer, swarm: Swarm) -> Iterator[Any]:
     """The page, open and showing three drones; fails the test on any script error or foreign request."""
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
-    context.set_default_timeout(DEADLINE_MS)
-    opened = context.new_page()
-    problems: list[str] = []
-    opened.on("pageerror", lambda error: problems.append(f"script error: {error}"))
-    opened.on("request", lambda r: None if r.url.startswith(server.url) else problems.append(f"foreign: {r.url}"))
-    opened.goto(server.url)
-    wait(opened, "Object.keys(window.imagineState?.drones ?? {}).length === 3")
-    swarm.run(0.1)  # opening takes long on a busy machine: what it shows shall be fresh
-    yield opened
-    context.close()
-    assert problems == []
+    with opened_page(browser, server.url) as opened:
+        wait(opened, "Object.keys(window.imagineState?.drones ?? {}).length === 3")
+        swarm.run(0.1)  # opening takes long on a busy machine: what it shows shall be fresh
+        yield opened
 
 
 def state(page: Any) -> dict[str, Any]:
