@@ -164,6 +164,6 @@ def test_goals_are_held_while_they_last() -> None:
 
 
 def test_an_unknown_name_is_refused_with_the_nearest() -> None:
-    assert set(BASELINES) == {"random", *PLANNERS}
+    assert set(BASELINES) == {"random", *PLANNERS, "clairvoyant"}
     with pytest.raises(InputError, match="coordinated"):
         baseline("cordinated", 0)
