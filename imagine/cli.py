@@ -438,7 +438,7 @@ def bench_seal(
 def bench_mesh(
     level: Annotated[str | None, typer.Option(help="which level is explored; by default 6")] = None,
     flights: Annotated[int | None, typer.Option(help="how many, to compare schedulers on; by default 4")] = None,
-    minutes: Annotated[float | None, typer.Option(help="a crowd hovers for so long; by default 60")] = None,
+    minutes: Annotated[float | None, typer.Option(help="a crowd flies to and fro for so long; by default 60")] = None,
     hostile: Annotated[int | None, typer.Option(help="so many false datagrams; by default 1000000")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="small and rough, in seconds")] = False,
     json_file: JsonFile = None,
