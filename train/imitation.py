@@ -166,10 +166,11 @@ def learn(
             loss.backward()  # type: ignore[no-untyped-call]
             norm = float(nn.utils.clip_grad_norm_(actor.parameters(), 1.0))
             if not (math.isfinite(loss.item()) and math.isfinite(norm)):
+                phase = "imitation" if isinstance(settings, ImitationSettings) else "rehearsal"
                 raise WorkError(
-                    f"imitation diverged: the loss of the actor is {loss.item()}, its gradient {norm} long; "
-                    "begin anew, for imitation leaves no checkpoint before its end: imagine train --resume RUN --set "
-                    "imitation.lr=… with a smaller one, or --set imitation.precision=float32"
+                    f"{phase} diverged: the loss of the actor is {loss.item()}, its gradient {norm} long; "
+                    f"begin anew, for {phase} leaves no checkpoint before its end: imagine train --resume RUN --set "
+                    f"{phase}.lr=… with a smaller one, or --set {phase}.precision=float32"
                 )
             optimiser.step()
             losses.append(loss.item())

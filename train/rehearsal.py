@@ -60,4 +60,5 @@ class RehearsalPilot:
         for pilot, its in zip(self._pilots, (~late & ~designed, designed, late), strict=True):
             if (its & wanted).any():
                 actions[its] = pilot.act(env, observation, its & wanted)[its]
+        actions[~env.alive] = np.nan  # a policy says something for the dead as well
         return actions

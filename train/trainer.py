@@ -245,7 +245,7 @@ class Trainer:
             steps = settings.round_steps * env.worlds * env.drones
             numbers = {"loss": loss, "planner_share": planner_share, "labelled_share": labels / steps}
             seconds = {"collect": collected - began, "learn": time.monotonic() - collected}
-            self._after_update(steps, agent_steps, numbers, seconds, episodes)
+            self._after_update(env, steps, agent_steps, numbers, seconds, episodes)
         return observation
 
     def _own_rollouts(self) -> OwnRollouts:
@@ -287,7 +287,9 @@ class Trainer:
                     "act": collected - began - rollout.env_s,
                     "update": time.monotonic() - collected,
                 }
-                self._after_update(rollout.agent_steps, settings.agent_steps, numbers, seconds, rollout.episodes)
+                self._after_update(
+                    source, rollout.agent_steps, settings.agent_steps, numbers, seconds, rollout.episodes
+                )
             if not self._stop.is_set() and self.settings.rehearsal.agent_steps:
                 self.phase, self.updates = "rehearsal", 0
             self._last = self.checkpoint()  # while its workers live
@@ -295,9 +297,10 @@ class Trainer:
             self._folder.save(self._last, "improved")
 
     def _after_update(
-        self, steps: int, total: int, numbers: dict[str, float], seconds: dict[str, float], episodes: list[Any]
-    ) -> None:
-        """Count, report, and save when it is time."""
+        self, flown: Exploration | RolloutSource, steps: int, total: int, numbers: dict[str, float],
+        seconds: dict[str, float], episodes: list[Any],
+    ) -> None:  # fmt: skip
+        """Count, report, and save when it is time; what the curriculum changes is for the worlds that are flown."""
         self.updates += 1
         self.agent_steps[self.phase] += steps
         self.episodes.add(episodes)
@@ -305,7 +308,7 @@ class Trainer:
         for event in events:
             logger.log(logging.WARNING if event.kind == "given up" else logging.INFO, "%s", event)
         if events:
-            (self._source or self.env).set_level_weights(self.curriculum.level_weights())
+            flown.set_level_weights(self.curriculum.level_weights())
         report = Report(
             phase=self.phase,
             agent_steps=sum(self.agent_steps.values()),

@@ -61,13 +61,13 @@ class _Best:
     level: Level
     searches: int = 0
     ticks: float = math.inf
-    plan: _Plan | None = None
+    plan: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None
 
-    def take(self, found: tuple[float, _Plan]) -> None:
-        """Keep a plan if it is the best; count it anyway."""
+    def take(self, ticks: float, plan: _Plan) -> None:
+        """Keep a plan's waypoints if it is the best, not what they lie in, which is large; count it anyway."""
         self.searches += 1
-        if found[0] < self.ticks:
-            self.ticks, self.plan = found
+        if ticks < self.ticks:
+            self.ticks, self.plan = ticks, (plan.way, plan.lengths)
 
 
 class ClairvoyantPilot:
@@ -126,9 +126,10 @@ class ClairvoyantPilot:
             return _Plan(known, plan.way, plan.lengths, generator)
         best = self._from_launch_points.setdefault((id(level), drones), _Best(level))
         if best.searches < _SEARCHES:
-            best.take(self._search(known, level, drones, speed, best.searches))
+            best.take(*self._search(known, level, drones, speed, best.searches))
         assert best.plan is not None
-        return _Plan(known, best.plan.way.copy(), best.plan.lengths.copy(), generator)
+        way, lengths = best.plan
+        return _Plan(known, way.copy(), lengths.copy(), generator)
 
     def _search(
         self, known: Clairvoyant, level: Level, drones: int, speed_mps: float, search: int
