@@ -8,9 +8,11 @@ out.
 
 from __future__ import annotations
 
+from typing import Self
+
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from imagine.sim.exploration import Exploration, Observation
 from imagine.train.imitation import LabelSettings, Teacher
@@ -29,6 +31,15 @@ class RehearsalSettings(LabelSettings):
     stop_coverage: float = Field(default=0.985, gt=0.0, le=1.0, description="share seen that ends an episode")
     student_draws: bool = Field(default=False, description="the student flies what it draws, not its best")
     planner_share: float = Field(default=0.5, ge=0.0, le=1.0, description="drones the teachers fly in round one")
+
+    @model_validator(mode="after")
+    def _late_comes_before_the_end(self) -> Self:
+        if self.late_coverage >= self.stop_coverage:
+            raise ValueError(
+                f"rehearsal.late_coverage {self.late_coverage} is not below stop_coverage {self.stop_coverage}: "
+                "the late teacher would never be asked"
+            )
+        return self
 
 
 class RehearsalPilot:

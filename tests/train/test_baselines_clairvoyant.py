@@ -11,7 +11,7 @@ from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.baselines import baseline
 from imagine.train.pilots import Pilot
-from imagine.train.rehearsal import RehearsalPilot
+from imagine.train.rehearsal import RehearsalPilot, RehearsalSettings
 
 
 def worlds(level: str, number: int, **changes: Any) -> Exploration:
@@ -77,3 +77,8 @@ def test_of_worlds_that_nobody_asks_for_it_says_nothing() -> None:
     actions = pilot.act(env, observation, asked)
     assert np.isfinite(actions[asked]).any()
     assert np.isnan(actions[~asked]).all()
+
+
+def test_a_late_teacher_that_would_never_be_asked_is_refused() -> None:
+    with pytest.raises(ValueError, match="never be asked"):
+        RehearsalSettings(late_coverage=0.99, stop_coverage=0.985)
