@@ -213,8 +213,6 @@ class Trainer:
             baseline(settings.launch_point_teacher, run.seed), baseline(settings.late_teacher, run.seed),
             settings.late_coverage,
         )  # fmt: skip
-        for group in learner.imitation.param_groups:
-            group["lr"] = settings.lr
         learner.imitation.state.clear()
         recall = Recall.nothing(learner.actor, env.worlds * env.drones)
         self._learn_labels(env, env.reset(), recall, teacher, settings, settings.agent_steps)

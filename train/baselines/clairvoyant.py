@@ -46,6 +46,12 @@ class _Plan:
     tries: int = _TRIES
     heat: float = _HEAT
 
+    @staticmethod
+    def empty(known: Clairvoyant, drones: int, generator: np.random.Generator, tries: int, heat: float) -> _Plan:
+        """Return the plan of a team that stays where it is."""
+        way, lengths = np.zeros((drones, MOST_WAYPOINTS), np.int64), np.zeros(drones, np.int64)
+        return _Plan(known, way, lengths, generator, tries, heat)
+
     def improve(self, starts: NDArray[np.int64], seen: NDArray[np.uint64], speed_mps: float) -> float:
         """Mend the plan from where drones are and for what is not yet seen; return the ticks that it takes."""
         needed = math.ceil(_SHARE * self.known.cells)
@@ -119,9 +125,8 @@ class ClairvoyantPilot:
         self._levels.move_to_end(id(level))
         known = self._levels[id(level)][1]
         generator = np.random.default_rng([self._seed, env.twin.world_keys[world], int(env.twin.episodes[world])])
-        way, lengths = np.zeros((drones, MOST_WAYPOINTS), np.int64), np.zeros(drones, np.int64)
         if not env.as_designed[world]:
-            plan = _Plan(known, way, lengths, generator, _FIRST_TRIES, _FIRST_HEAT)
+            plan = _Plan.empty(known, drones, generator, _FIRST_TRIES, _FIRST_HEAT)
             plan.improve(_points(known, env.twin.poses[world]), known.bits_of(env.maps.seen[world]), speed)
             return _Plan(known, plan.way, plan.lengths, generator)
         best = self._from_launch_points.setdefault((id(level), drones), _Best(level))
@@ -137,9 +142,7 @@ class ClairvoyantPilot:
         """Return a plan from the level's launch point, and the ticks that it takes."""
         starts = _points(known, np.array([pose[:2] for pose in level.launch_poses(drones)]))
         nothing = np.zeros(known.seen.shape[1], np.uint64)
-        way, lengths = np.zeros((drones, MOST_WAYPOINTS), np.int64), np.zeros(drones, np.int64)
-        generator = np.random.default_rng([self._seed, search])
-        plan = _Plan(known, way, lengths, generator, _SEARCH_TRIES, _SEARCH_HEAT)
+        plan = _Plan.empty(known, drones, np.random.default_rng([self._seed, search]), _SEARCH_TRIES, _SEARCH_HEAT)
         return plan.improve(starts, nothing, speed_mps), plan
 
     def _advise(
