@@ -55,7 +55,7 @@ class TrainingBench:
         learner = Learner.create(settings)
         self.actor, self.critic = learner.actor, learner.critic
         self.optimisers, self.generator = learner.ppo, learner.generator
-        self.env = Exploration(Curriculum(settings.curriculum, settings.env).environment, settings.run.seed)
+        self.env = Exploration(Curriculum(settings.curriculum, settings.practice).environment, settings.run.seed)
         self.observation = self.env.reset()
         self.recall = Recall.nothing(self.actor, self.env.worlds * self.env.drones)
 
@@ -125,7 +125,7 @@ class TrainingBench:
             "training": {
                 "value": statistics.median(rates), "unit": "agent-steps/s", "low": min(rates), "high": max(rates),
                 "per_cpu_s": statistics.median(cpu_rates),
-                "drone_ticks_per_s": statistics.median(rates) * self.settings.env.action.decision_ticks,
+                "drone_ticks_per_s": statistics.median(rates) * self.env.settings.action.decision_ticks,
                 "rounds": len(rates), "worlds": self.env.worlds, "drones": self.env.drones,
                 "precision": str(compute_dtype(self.settings.ppo.precision, self.actor.device)).removeprefix("torch."),
                 "device": self.actor.device.type, "threads": torch.get_num_threads(),

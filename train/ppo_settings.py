@@ -13,6 +13,10 @@ class PpoSettings(Settings):
     """Every hyperparameter of PPO. Those that are schedules take a number, or `start`, `end`, `shape` and `until`."""
 
     agent_steps: int = Field(default=2_500_000, ge=0, description="decisions of all drones; where training ends")
+    decision_ticks: int | None = Field(
+        default=None, ge=1, le=100,
+        description="ticks that a decision stands for in imitation and PPO; none: as in flight, env.action's",
+    )  # fmt: skip
     rollout_steps: int = Field(default=64, ge=2, description="steps of every world between two updates")
     epochs: int = Field(default=2, ge=1, description="passes over a rollout; more drift from the policy that flew it")
     minibatch: int = Field(default=1152, ge=2, description="samples a gradient step, about; a quarter of 24 x 64 x 3")

@@ -47,6 +47,13 @@ class TrainSettings(Settings):
     rehearsal: RehearsalSettings = Field(default_factory=RehearsalSettings)
     tracking: TrackingSettings = Field(default_factory=TrackingSettings)
 
+    @property
+    def practice(self) -> ExplorationSettings:
+        """What imitation and PPO fly in: `env`, where decisions stand for `ppo.decision_ticks`."""
+        ticks = self.ppo.decision_ticks or self.env.action.decision_ticks
+        action = self.env.action.model_copy(update={"decision_ticks": ticks})
+        return self.env.model_copy(update={"action": action})
+
     @model_validator(mode="after")
     def _choice_has_choices(self) -> Self:
         observation, action = self.env.observation, self.env.action

@@ -116,7 +116,7 @@ class Trainer:
     phase: Phase = "imitation"
 
     def __post_init__(self) -> None:
-        self.curriculum = Curriculum(self.settings.curriculum, self.settings.env)
+        self.curriculum = Curriculum(self.settings.curriculum, self.settings.practice)
         if self.resumed is not None:
             self.curriculum.load_state_dict(self.resumed.progress["curriculum"])
         self.env = Exploration(self.curriculum.environment, self.settings.run.seed)
@@ -205,7 +205,8 @@ class Trainer:
         settings, run, learner = self.settings.rehearsal, self.settings.run, self.learner
         if self.agent_steps["rehearsal"] >= settings.agent_steps:
             return
-        environment = self.curriculum.environment.model_copy(update={"stop_coverage": settings.stop_coverage})
+        as_flown = {"action": self.settings.env.action, "stop_coverage": settings.stop_coverage}
+        environment = self.curriculum.environment.model_copy(update=as_flown)
         env = Exploration(environment, run.seed + _REHEARSAL_SEED)
         env.set_level_weights(self.curriculum.level_weights())
         teacher = RehearsalPilot(

@@ -80,7 +80,7 @@ class Actor(Computing):
                     "along the observation's axes: env.action.mode plane or waypoint"
                 )
             numbers = spec.shapes["frontiers"][1]
-            self.choice = ChoiceHead(numbers, self.feature_size, hidden // 2)
+            self.choice = ChoiceHead(numbers, self.feature_size, hidden // 2, settings.choice_momentum)
         self.taken_size = action_size if self.choice is None else 1
         self.is_coherent = self.choice is not None and settings.choice_noise == "coherent"
         self._along_heading = spec.axes == "heading"

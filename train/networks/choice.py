@@ -17,10 +17,13 @@ class ChoiceHead(nn.Module):
 
     What is drawn while it learns is a frontier, not a direction: an exploring policy then tries what a planner would,
     going elsewhere, and not to tremble on its way. All in float32: differences of scores are what is learned from.
+    `momentum` is what a frontier's score gains where the drone flies its way at full speed, and loses where it flies
+    the other way: where nothing learned speaks for either of two, it does not turn to and fro between them.
     """
 
-    def __init__(self, numbers: int, features: int, hidden: int) -> None:
+    def __init__(self, numbers: int, features: int, hidden: int, momentum: float = 0.0) -> None:
         super().__init__()
+        self.momentum = momentum
         self.features = orthogonal(nn.Linear(features, hidden))
         self.each = orthogonal(nn.Linear(numbers + 1, hidden))
         self.mixed = orthogonal(nn.Linear(hidden, hidden))
@@ -36,7 +39,7 @@ class ChoiceHead(nn.Module):
         hidden = torch.relu(self.each(frontiers) + self.features(features).unsqueeze(1))
         hidden = torch.relu(self.mixed(hidden))
         scores: Tensor = self.score(hidden).squeeze(2)
-        return scores + (frontiers[..., 0] - 1.0) * _NOT_SHOWN
+        return scores + self.momentum * along.squeeze(2) + (frontiers[..., 0] - 1.0) * _NOT_SHOWN
 
 
 def direction_of(frontiers: Tensor, choice: Tensor) -> Tensor:
