@@ -33,6 +33,11 @@ class LabelSettings(Settings):
     """How labels are gathered and learned from."""
 
     round_steps: int = Field(default=32, ge=1, description="steps of every world between two rounds of learning")
+    label_every: int = Field(
+        default=1, ge=1, le=100,
+        description="steps from one label to the next: states that follow on one another are alike; a policy with a "
+        "memory is labelled at every step",
+    )  # fmt: skip
     gradient_steps: int = Field(default=24, ge=1, description="steps of Adam a round")
     minibatch: int = Field(default=512, ge=1)
     lr: float = Field(default=1e-3, gt=0.0)
@@ -75,10 +80,12 @@ def collect_labels(
     precision: Precision = "float32",
     recall: Recall | None = None,
     student_draws: bool = True,
+    label_every: int = 1,
 ) -> tuple[Observation, list[EpisodeMetrics], int]:
-    """Fly `steps` in all worlds and label every state; return the next observation, finished episodes and labels added.
+    """Fly `steps` in all worlds and label states; return the next observation, finished episodes and labels added.
 
-    Which drones the planner flies is drawn once a call, so that the student's own mistakes have time to unfold.
+    Every `label_every`-th state is labelled, and until the next what the planner flies keeps its way. Which drones it
+    flies is drawn once a call, so that the student's own mistakes have time to unfold.
     `recall` is what the student remembers so far, and is brought up to date; without one everybody's episode begins.
     """
     agents = env.worlds * env.drones
@@ -87,18 +94,22 @@ def collect_labels(
     episodes: list[EpisodeMetrics] = []
     added = 0
     flown = Round.empty(recall) if isinstance(buffer, RoundBuffer) else None
+    every = 1 if actor.state_size else label_every
+    labels = torch.full((agents, env.settings.action.size), math.nan)
     with at_precision(precision, actor):
         noise = actor.noise(steps, agents, generator)
         for t in range(steps):
             seen = stored(agent_tensors(observation, actor.is_central), torch.float16, actor.device)
             alive = living(env)
-            labels = torch.from_numpy(teacher.act(env, observation).reshape(agents, -1))
+            if t % every == 0:
+                labels = torch.from_numpy(teacher.act(env, observation).reshape(agents, -1))
             labelled = torch.isfinite(labels).all(dim=1)
-            added += int(labelled.sum())
-            if flown is not None:
-                flown.add(seen, labels, alive, recall.starts)
-            elif isinstance(buffer, LabelBuffer):
-                buffer.add({key: value[labelled] for key, value in seen.items()}, labels[labelled])
+            if t % every == 0:
+                added += int(labelled.sum())
+                if flown is not None:
+                    flown.add(seen, labels, alive, recall.starts)
+                elif isinstance(buffer, LabelBuffer):
+                    buffer.add({key: value[labelled] for key, value in seen.items()}, labels[labelled])
             decisions = next_decisions(actor, {**seen, "alive": alive.to(actor.device)}, recall, env.drones)
             actions = decisions.mean.cpu()
             if student_draws:
@@ -110,7 +121,9 @@ def collect_labels(
             teacher.forget(step.done)
             episodes.extend(step.episodes)
             observation = step.observation
-            recall.starts = torch.from_numpy(np.repeat(step.done, env.drones)).to(actor.device)
+            begins = torch.from_numpy(np.repeat(step.done, env.drones))
+            labels = labels.masked_fill(begins[:, None], math.nan)
+            recall.starts = begins.to(actor.device)
     if flown is not None and isinstance(buffer, RoundBuffer):
         buffer.add_round(flown, env.drones if actor.is_central else 1)
     return observation, episodes, added

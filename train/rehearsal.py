@@ -2,19 +2,21 @@
 
 PPO keeps a plan of a whole flight no better than it finds one: its chance blurs what has to be done exactly. So the
 last lessons are labels again. From a level's own launch point `clairvoyant` gives them, which plans by the true level;
-anywhere else the policy itself, as it came from PPO; and where nearly all is seen a planner, which leaves no corner
-out.
+anywhere else, and in generated houses, of which there are too many to be known, the policy itself, as it came from PPO;
+and where nearly all is seen a planner, which leaves no corner out.
 """
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from imagine.sim.exploration import Exploration, Observation
+from imagine.sim.exploration_settings import ExplorationSettings
+from imagine.sim.generator import PREFIX
 from imagine.train.imitation import LabelSettings, Teacher
 from imagine.train.pilots import Actions, Pilot
 
@@ -22,15 +24,31 @@ from imagine.train.pilots import Actions, Pilot
 class RehearsalSettings(LabelSettings):
     """How long and by whom a policy is taught after PPO."""
 
-    agent_steps: int = Field(default=0, ge=0, description="labelled decisions; 0 leaves rehearsal out")
+    agent_steps: int = Field(default=0, ge=0, description="decisions of all drones; 0 leaves rehearsal out")
+    level_weights: tuple[float, ...] | None = Field(
+        default=None, description="share of episodes of each of env.levels, as env.level_weights; none: as in PPO"
+    )
+    as_designed: float | None = Field(
+        default=None, ge=0.0, le=1.0, description="as env.as_designed; none: as in PPO"
+    )  # fmt: skip
     launch_point_teacher: Teacher = Field(
-        default="clairvoyant", description="who labels what began at the launch point of a level as it is"
+        default="clairvoyant",
+        description="who labels what began at the launch point of a level as it is, but for generated houses",
     )
     late_teacher: Teacher = Field(default="coordinated", description="who labels worlds that are nearly explored")
     late_coverage: float = Field(default=0.92, gt=0.0, le=1.0, description="share seen from which on it does")
     stop_coverage: float = Field(default=0.985, gt=0.0, le=1.0, description="share seen that ends an episode")
     student_draws: bool = Field(default=False, description="the student flies what it draws, not its best")
     planner_share: float = Field(default=0.5, ge=0.0, le=1.0, description="drones the teachers fly in round one")
+
+    def environment(self, env: ExplorationSettings) -> ExplorationSettings:
+        """Return what is flown in, by the environment of PPO."""
+        changes: dict[str, Any] = {"stop_coverage": self.stop_coverage}
+        if self.level_weights is not None:
+            changes["level_weights"] = self.level_weights
+        if self.as_designed is not None:
+            changes["as_designed"] = self.as_designed
+        return env.model_copy(update=changes)
 
     @model_validator(mode="after")
     def _late_comes_before_the_end(self) -> Self:
@@ -65,7 +83,8 @@ class RehearsalPilot:
     def act(self, env: Exploration, observation: Observation, worlds: NDArray[np.bool_] | None = None) -> Actions:
         """Return the actions of the pilot whose world it is, `[worlds, drones, action size]`; nan where it has none."""
         late = env.maps.coverage() >= self._late_coverage
-        designed = env.as_designed & ~late
+        houses = [level.name.startswith(PREFIX) for level in env.twin.levels]
+        designed = env.as_designed & ~late & ~np.array(houses)
         wanted = np.ones(env.worlds, np.bool_) if worlds is None else worlds
         actions = np.full((env.worlds, env.drones, env.settings.action.size), np.nan, np.float32)
         for pilot, its in zip(self._pilots, (~late & ~designed, designed, late), strict=True):

@@ -134,15 +134,22 @@ class Trainer:
             self.learner.restore(self.resumed)
             self.agent_steps |= self.resumed.agent_steps
             self.updates, self.phase = self.resumed.updates, self.resumed.phase
-            if self.phase == "rehearsal" and self.agent_steps["ppo"] < self.settings.ppo.agent_steps:
-                if self.agent_steps["rehearsal"]:
-                    raise InputError(
-                        "ppo.agent_steps: this checkpoint has been rehearsed; for more PPO, and rehearsal after it, "
-                        "resume from checkpoints/improved.pt"
-                    )
+            longer = [phase for phase in ("ppo", "rehearsal") if self.agent_steps[phase] < self._total(phase)]
+            if self.agent_steps["rehearsal"] and longer:
+                raise InputError(
+                    f"{longer[0]}.agent_steps: this checkpoint has been rehearsed; for more PPO, or a longer rehearsal, "
+                    "resume from checkpoints/improved.pt"
+                )
+            if self.phase == "rehearsal" and "ppo" in longer:
                 self.phase = "ppo"
             self._wall_before_s = self.resumed.wall_s
             self.episodes.load_state_dict(self.resumed.progress["episodes"])
+
+    def _total(self, phase: Phase) -> int:
+        """Return the decisions of all drones that a phase is to come to."""
+        return {"imitation": self.settings.imitation, "ppo": self.settings.ppo, "rehearsal": self.settings.rehearsal}[
+            phase
+        ].agent_steps
 
     def _take_up(self, state: dict[str, Any] | None) -> None:
         """Let the environment of this process go on from a checkpoint's state, or begin."""
@@ -205,10 +212,10 @@ class Trainer:
         settings, run, learner = self.settings.rehearsal, self.settings.run, self.learner
         if self.agent_steps["rehearsal"] >= settings.agent_steps:
             return
-        as_flown = {"action": self.settings.env.action, "stop_coverage": settings.stop_coverage}
-        environment = self.curriculum.environment.model_copy(update=as_flown)
+        as_flown = self.curriculum.environment.model_copy(update={"action": self.settings.env.action})
+        environment = settings.environment(as_flown)
         env = Exploration(environment, run.seed + _REHEARSAL_SEED)
-        env.set_level_weights(self.curriculum.level_weights())
+        self.episodes = RecentEpisodes(environment.episode_ticks, self.curriculum.levels, environment.stop_coverage)
         teacher = RehearsalPilot(
             PolicyPilot(policy_of(copy.deepcopy(learner.actor), run.name, environment)),
             baseline(settings.launch_point_teacher, run.seed), baseline(settings.late_teacher, run.seed),
@@ -235,7 +242,7 @@ class Trainer:
             planner_share = settings.planner_share * max(0.0, 1.0 - done_share / until)
             observation, episodes, labels = collect_labels(
                 env, observation, learner.actor, teacher, buffer, settings.round_steps, planner_share, learner.rng,
-                learner.generator, settings.precision, recall, settings.student_draws,
+                learner.generator, settings.precision, recall, settings.student_draws, settings.label_every,
             )  # fmt: skip
             collected = time.monotonic()
             for group in learner.imitation.param_groups:
@@ -303,7 +310,9 @@ class Trainer:
         self.updates += 1
         self.agent_steps[self.phase] += steps
         self.episodes.add(episodes)
-        events = self.curriculum.observe(episodes, sum(self.agent_steps.values()))
+        events = []
+        if self.phase != "rehearsal":  # whose worlds and ends are other ones
+            events = self.curriculum.observe(episodes, sum(self.agent_steps.values()))
         for event in events:
             logger.log(logging.WARNING if event.kind == "given up" else logging.INFO, "%s", event)
         if events:

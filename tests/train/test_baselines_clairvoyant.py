@@ -69,6 +69,16 @@ def test_in_rehearsal_each_world_has_the_teacher_for_where_it_began_and_how_far_
     assert (~designed & ~late).any()
 
 
+def test_generated_houses_are_not_learned_by_heart() -> None:
+    env = worlds("house:3001:60", 3, observation={"frontiers": 8}, as_designed=1.0)
+    observation = env.reset()
+    assert env.as_designed.all()
+    policy = baseline("frontier", 0)
+    both = RehearsalPilot(policy, baseline("clairvoyant", 0), baseline("coordinated", 0), late_coverage=0.92)
+    both.begin(env)
+    np.testing.assert_array_equal(both.act(env, observation), policy.act(env, observation))
+
+
 def test_of_worlds_that_nobody_asks_for_it_says_nothing() -> None:
     env, pilot = worlds("2", 3), baseline("clairvoyant", 0)
     observation = env.reset()

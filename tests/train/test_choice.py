@@ -122,3 +122,18 @@ def test_a_policy_that_chooses_is_not_told_to_have_a_spread():
     numbers = update(actor, critic, optimisers, rollout_with_blind_rows(actor, 8), PpoSettings(minibatch=64), generator)
     assert not [name for name in numbers if name.startswith(("action_std", "action_abs"))]
     assert "actor_lr" in numbers
+
+
+def test_where_nothing_else_speaks_for_one_the_frontier_that_it_flies_to_already_is_kept():
+    torch.manual_seed(0)
+    actor = Actor(SMALL, SPEC, 2)
+    with torch.no_grad():
+        actor.choice.score.weight.zero_()
+    seen = {key: torch.zeros((3, *shape)) for key, shape in SPEC.shapes.items()}
+    seen["frontiers"][:, :3, 0] = 1.0
+    seen["frontiers"][:, :3, 1:3] = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+    seen["motion"][:, :2] = torch.tensor([[0.0, 1.0], [-0.5, 0.0], [0.0, 0.0]])
+    scores = actor.decide(seen).scores
+    assert scores.argmax(dim=1).tolist() == [1, 2, 0]
+    torch.testing.assert_close(scores[1, 2] - scores[1, 0], torch.tensor(SMALL.choice_momentum))
+    assert (scores[:, 3] < scores[:, :3].amin(dim=1)).all()

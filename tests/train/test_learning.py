@@ -216,6 +216,35 @@ def test_imitation_comes_close_to_the_planner():
     assert after < 0.3 * before
 
 
+def test_between_two_labels_what_the_planner_flies_keeps_its_way():
+    class Clock:
+        """Says (step / 100, 0) to everyone, and remembers when it was asked."""
+
+        name, asked, step = "clock", [], 0
+
+        def begin(self, env):
+            pass
+
+        def forget(self, worlds):
+            self.step += 1
+
+        def act(self, env, observation, worlds=None):
+            self.asked.append(self.step)
+            return np.full((env.worlds, env.drones, 2), [self.step / 100, 0.0], np.float32)
+
+    env = Exploration(ExplorationSettings(levels=("4",), worlds=2, drones=2, observation=SPEC), 0)
+    flown, step = [], env.step
+    env.step = lambda actions: (flown.append(actions.copy()), step(actions))[1]
+    teacher, buffer, actor = Clock(), LabelBuffer(1000), Actor(SMALL, SPEC, 2)
+    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    _, _, added = collect_labels(
+        env, env.reset(), actor, teacher, buffer, 10, 1.0, rng, generator, label_every=4
+    )  # fmt: skip
+    assert teacher.asked == [0, 4, 8]
+    assert added == len(buffer) == 3 * 4
+    assert [round(100 * float(actions[0, 0, 0])) for actions in flown] == [0, 0, 0, 0, 4, 4, 4, 4, 8, 8]
+
+
 def test_the_buffer_keeps_the_newest_labels():
     buffer = LabelBuffer(10)
     for first in range(0, 24, 4):

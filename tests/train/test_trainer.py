@@ -12,6 +12,8 @@ import yaml
 
 from imagine.core.errors import InputError
 from imagine.sim import level as sim_level
+from imagine.sim.exploration import Exploration
+from imagine.train import trainer
 from imagine.train.checkpoint import load_checkpoint
 from imagine.train.evaluation import evaluate
 from imagine.train.learner import Learner
@@ -176,6 +178,35 @@ def test_a_rehearsed_run_that_is_to_be_longer_goes_back_to_ppo_and_rehearses_aga
     longer = train(None, ("ppo.agent_steps=640",), resume=improved, report=lambda report: phases.append(report.phase))
     assert phases == ["ppo"] + ["rehearsal"] * 3
     assert longer.agent_steps == 256 + 640 + 384
+
+
+def test_a_rehearsed_policy_is_not_rehearsed_on(rehearsed, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(rehearsed.folder, copy)
+    with pytest.raises(InputError, match=r"^rehearsal\.agent_steps: .*improved\.pt"):
+        train(None, ("rehearsal.agent_steps=768",), resume=copy)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (("rehearsal.level_weights=[1, 2, 3, 4, 5]",), r"rehearsal\.level_weights: give one weight for each"),
+        (("rehearsal.level_weights=[1]", "curriculum.mode=parallel", "curriculum.lessons=[{levels: ['0']}]"), "shares"),
+    ],
+)
+def test_shares_of_levels_that_no_rehearsal_could_have_are_refused_before_anything_is_learned(changes, message):
+    with pytest.raises(InputError, match=message):
+        load_train_settings(Path("smoke"), changes)
+
+
+def test_what_is_learned_and_what_is_flown_may_decide_at_other_intervals(tmp_path, monkeypatch):
+    flown_in = []
+    monkeypatch.setattr(
+        trainer, "Exploration", lambda env, seed: flown_in.append(env.action.decision_ticks) or Exploration(env, seed)
+    )
+    run = train(Path("smoke"), overrides(tmp_path, *REHEARSED, "ppo.decision_ticks=3"))
+    assert flown_in == [3, 1]
+    assert load_policy(run.folder).env.action.decision_ticks == 1
 
 
 def test_a_run_is_never_overwritten(finished, tmp_path):
