@@ -65,7 +65,6 @@ class TrainSettings(Settings):
             )
         return self
 
-
     @model_validator(mode="after")
     def _rehearsal_fits(self) -> Self:
         weights = self.rehearsal.level_weights

@@ -137,8 +137,8 @@ class Trainer:
             longer = [phase for phase in ("ppo", "rehearsal") if self.agent_steps[phase] < self._total(phase)]
             if self.agent_steps["rehearsal"] and longer:
                 raise InputError(
-                    f"{longer[0]}.agent_steps: this checkpoint has been rehearsed; for more PPO, or a longer rehearsal, "
-                    "resume from checkpoints/improved.pt"
+                    f"{longer[0]}.agent_steps: this checkpoint has been rehearsed; for more PPO, or rehearsal, resume "
+                    "from checkpoints/improved.pt"
                 )
             if self.phase == "rehearsal" and "ppo" in longer:
                 self.phase = "ppo"

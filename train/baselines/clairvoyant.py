@@ -21,18 +21,21 @@ from imagine.sim.clairvoyant import MOST_WAYPOINTS, Clairvoyant
 from imagine.sim.clairvoyant_kernels import ahead, path_through
 from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.level import Level
+from imagine.sim.workers import Workers
 from imagine.train.pilots import Actions
 
 _SHARE = 0.91
 """Of the cells, planned for: what is timed, and a little more, for from the lattice more is seen than drones see."""
 _EVERY_CELL = 2
 _NEAR_FACTOR = 1.5
-_SEARCHES, _SEARCH_TRIES, _SEARCH_HEAT = 12, 60_000, 12.0  # from a level's own launch point, at its first launches
+_SEARCHES, _SEARCH_TRIES, _SEARCH_HEAT = 12, 60_000, 12.0  # from a level's own launch point, once
 _FIRST_TRIES, _FIRST_HEAT = 6000, 12.0  # from elsewhere, once an episode
 _TRIES, _HEAT = 60, 0.3  # at every decision
 _PER_METRE = 0.02  # ticks: of plans that are equally quick the shorter one is meant
 _REACHED_M, _BY_M, _NEAR_BY_M = 0.45, 0.9, 2.0
 _KEPT = 96  # levels, mirrors counted; some 15 MB each
+
+_Waypoints = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 @dataclass
@@ -60,22 +63,6 @@ class _Plan:
         )
 
 
-@dataclass
-class _Best:
-    """The best plan found so far from a level's launch point; the level is held so that its id stays its own."""
-
-    level: Level
-    searches: int = 0
-    ticks: float = math.inf
-    plan: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None
-
-    def take(self, ticks: float, plan: _Plan) -> None:
-        """Keep a plan's waypoints if it is the best, not what they lie in, which is large; count it anyway."""
-        self.searches += 1
-        if ticks < self.ticks:
-            self.ticks, self.plan = ticks, (plan.way, plan.lengths)
-
-
 class ClairvoyantPilot:
     """Flies every drone by a team plan through the true level, toward the frontiers that it comes by."""
 
@@ -85,7 +72,7 @@ class ClairvoyantPilot:
         """Make a pilot that has yet to begin; `seed` is of the search for plans."""
         self._seed = seed
         self._levels: OrderedDict[int, tuple[Level, Clairvoyant]] = OrderedDict()
-        self._from_launch_points: dict[tuple[int, int], _Best] = {}
+        self._from_launch_points: dict[tuple[int, int], tuple[Level, _Waypoints]] = {}
         self._plans: list[_Plan | None] = []
 
     def begin(self, env: Exploration) -> None:
@@ -129,21 +116,29 @@ class ClairvoyantPilot:
             plan = _Plan.empty(known, drones, generator, _FIRST_TRIES, _FIRST_HEAT)
             plan.improve(_points(known, env.twin.poses[world]), known.bits_of(env.maps.seen[world]), speed)
             return _Plan(known, plan.way, plan.lengths, generator)
-        best = self._from_launch_points.setdefault((id(level), drones), _Best(level))
-        if best.searches < _SEARCHES:
-            best.take(*self._search(known, level, drones, speed, best.searches))
-        assert best.plan is not None
-        way, lengths = best.plan
+        key = id(level), drones
+        if key not in self._from_launch_points:  # with the level, so that its id stays its own
+            self._from_launch_points[key] = level, self._search(known, level, drones, speed, env.twin.workers)
+        way, lengths = self._from_launch_points[key][1]
         return _Plan(known, way.copy(), lengths.copy(), generator)
 
-    def _search(
-        self, known: Clairvoyant, level: Level, drones: int, speed_mps: float, search: int
-    ) -> tuple[float, _Plan]:
-        """Return a plan from the level's launch point, and the ticks that it takes."""
+    def _search(self, known: Clairvoyant, level: Level, drones: int, speed_mps: float, workers: Workers) -> _Waypoints:
+        """Return the waypoints of the best of several plans from the level's launch point."""
         starts = _points(known, np.array([pose[:2] for pose in level.launch_poses(drones)]))
         nothing = np.zeros(known.seen.shape[1], np.uint64)
-        plan = _Plan.empty(known, drones, np.random.default_rng([self._seed, search]), _SEARCH_TRIES, _SEARCH_HEAT)
-        return plan.improve(starts, nothing, speed_mps), plan
+        plans = [
+            _Plan.empty(known, drones, np.random.default_rng([self._seed, search]), _SEARCH_TRIES, _SEARCH_HEAT)
+            for search in range(_SEARCHES)
+        ]
+        ticks = np.zeros(_SEARCHES)
+
+        def improve(first: int, last: int) -> None:
+            for search in range(first, last):
+                ticks[search] = plans[search].improve(starts, nothing, speed_mps)
+
+        workers.over(_SEARCHES, improve)
+        best = plans[int(ticks.argmin())]
+        return best.way, best.lengths
 
     def _advise(
         self, env: Exploration, world: int, directions: NDArray[np.float64], frontiers: NDArray[np.float32] | None
