@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.sim.generator import PREFIX
+from imagine.sim.level_names import expand_levels
 from imagine.train.imitation import LabelSettings, Teacher
 from imagine.train.pilots import Actions, Pilot
 
@@ -25,9 +26,10 @@ class RehearsalSettings(LabelSettings):
     """How long and by whom a policy is taught after PPO."""
 
     agent_steps: int = Field(default=0, ge=0, description="decisions of all drones; 0 leaves rehearsal out")
-    level_weights: tuple[float, ...] | None = Field(
-        default=None, description="share of episodes of each of env.levels, as env.level_weights; none: as in PPO"
-    )
+    known_share: float | None = Field(
+        default=None, ge=0.0, le=1.0,
+        description="share of episodes in levels that can be known, which generated houses are not; none: as in PPO",
+    )  # fmt: skip
     as_designed: float | None = Field(
         default=None, ge=0.0, le=1.0, description="as env.as_designed; none: as in PPO"
     )  # fmt: skip
@@ -44,10 +46,15 @@ class RehearsalSettings(LabelSettings):
     def environment(self, env: ExplorationSettings) -> ExplorationSettings:
         """Return what is flown in, by the environment of PPO."""
         changes: dict[str, Any] = {"stop_coverage": self.stop_coverage}
-        if self.level_weights is not None:
-            changes["level_weights"] = self.level_weights
         if self.as_designed is not None:
             changes["as_designed"] = self.as_designed
+        levels, weights = expand_levels(env.levels, env.level_weights)
+        known = np.array([not level.startswith(PREFIX) for level in levels])
+        shares, share = np.array(weights), self.known_share
+        if share is not None and shares[known].any() and shares[~known].any():
+            shares[known] *= share / shares[known].sum()
+            shares[~known] *= (1.0 - share) / shares[~known].sum()
+            changes |= {"levels": levels, "level_weights": tuple(shares.tolist())}
         return env.model_copy(update=changes)
 
     @model_validator(mode="after")

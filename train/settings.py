@@ -10,7 +10,6 @@ from pydantic import Field, model_validator
 from imagine.core.config import Settings, load_settings
 from imagine.core.errors import InputError
 from imagine.sim.exploration_settings import ExplorationSettings
-from imagine.sim.level_variants import level_shares
 from imagine.train.curriculum_settings import CurriculumSettings
 from imagine.train.imitation import ImitationSettings
 from imagine.train.networks import DeviceName, NetworkSettings, steers
@@ -63,17 +62,6 @@ class TrainSettings(Settings):
                 "network.head choice needs env.observation.frontiers above 0, and actions that are a direction along "
                 "the observation's axes: env.action.mode plane or waypoint; else take network.head gaussian"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _rehearsal_fits(self) -> Self:
-        weights = self.rehearsal.level_weights
-        if weights is not None and self.curriculum.mode != "off":
-            raise ValueError("rehearsal.level_weights: leave it out beside a curriculum, whose lessons have shares")
-        try:
-            level_shares(weights, len(self.env.levels))
-        except InputError as error:
-            raise ValueError(f"rehearsal.{error}") from error
         return self
 
 

@@ -24,6 +24,7 @@ from imagine.train.baselines import baseline
 from imagine.train.checkpoint import PHASES, Checkpoint, Phase, check_same_network, load_checkpoint
 from imagine.train.curriculum import Curriculum
 from imagine.train.evaluation import evaluate
+from imagine.train.folder_lock import locked
 from imagine.train.imitation import LabelSettings, collect_labels, label_buffer, learn
 from imagine.train.learner import Learner
 from imagine.train.pilots import Pilot
@@ -34,7 +35,6 @@ from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
 from imagine.train.rollout import Recall
 from imagine.train.rollout_source import OwnRollouts, RolloutSource
 from imagine.train.run_folder import RunFolder, run_record
-from imagine.train.run_lock import locked
 from imagine.train.settings import TrainSettings, load_train_settings
 from imagine.train.stopping import stop_requests
 
@@ -58,6 +58,7 @@ class RunResult:
     levels: dict[str, dict[str, float]]
 
 
+_BUSY = "is training in this folder; wait for it, end it, or take another name with --set run.name=…"
 _REHEARSAL_SEED = 7_000_003  # other worlds than PPO's
 
 
@@ -76,14 +77,14 @@ def train(
     if resume is None:
         settings = load_train_settings(config, overrides)
         trainer = Trainer(settings)
-        with locked(Path(settings.run.root) / settings.run.name):
+        with locked(Path(settings.run.root) / settings.run.name, _BUSY):
             return _run(trainer, RunFolder.create(settings), report)
     if config is not None:
         raise InputError("a resumed run has its configuration already: give CONFIG or --resume, not both")
     run = resume if resume.is_dir() else resume.parent.parent
     if not (resume.exists() and (run / "config.yaml").exists()):
         raise InputError(f"--resume {resume}: no run to go on with: give a run's folder, or a checkpoint in one")
-    with locked(run):  # before the checkpoint is read: whoever trained here until now may have left a newer one
+    with locked(run, _BUSY):  # before the checkpoint is read: whoever trained here until now may have left a newer one
         settings = load_train_settings(run / "config.yaml", overrides)
         checkpoint = None if _is_before_its_first_checkpoint(resume) else load_checkpoint(resume)
         trainer = Trainer(settings, checkpoint)
@@ -147,9 +148,7 @@ class Trainer:
 
     def _total(self, phase: Phase) -> int:
         """Return the decisions of all drones that a phase is to come to."""
-        return {"imitation": self.settings.imitation, "ppo": self.settings.ppo, "rehearsal": self.settings.rehearsal}[
-            phase
-        ].agent_steps
+        return int(getattr(self.settings, phase).agent_steps)
 
     def _take_up(self, state: dict[str, Any] | None) -> None:
         """Let the environment of this process go on from a checkpoint's state, or begin."""

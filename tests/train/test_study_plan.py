@@ -151,7 +151,7 @@ def test_a_changed_study_is_not_resumed_and_a_longer_one_is(tmp_path):
         folder.check_known(trials)
     with folder.locked():
         folder.write(first, trials)
-        with pytest.raises(InputError, match="running already"), folder.locked():
+        with pytest.raises(InputError, match="runs this study"), folder.locked():
             pass
     folder.check_known(trials)
     folder.check_known(planned(repeats=2)[1])

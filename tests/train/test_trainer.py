@@ -190,8 +190,19 @@ def test_a_rehearsed_policy_is_not_rehearsed_on(rehearsed, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (("rehearsal.level_weights=[1, 2, 3, 4, 5]",), r"rehearsal\.level_weights: give one weight for each"),
-        (("rehearsal.level_weights=[1]", "curriculum.mode=parallel", "curriculum.lessons=[{levels: ['0']}]"), "shares"),
+        (
+            ("rehearsal.agent_steps=9", "rehearsal.level_weights=[1, 2, 3, 4, 5]"),
+            r"rehearsal\.level_weights: give one weight for each",
+        ),
+        (
+            (
+                "rehearsal.agent_steps=9",
+                "rehearsal.level_weights=[1]",
+                "curriculum.mode=parallel",
+                "curriculum.lessons=[{levels: ['0']}]",
+            ),
+            "shares",
+        ),
     ],
 )
 def test_shares_of_levels_that_no_rehearsal_could_have_are_refused_before_anything_is_learned(changes, message):

@@ -9,7 +9,6 @@ runs/STUDY/results.json       what came out, also as results.csv and summary.png
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ import yaml
 
 from imagine.core.errors import InputError
 from imagine.train.atomic_file import write_atomically
+from imagine.train.folder_lock import locked
 from imagine.train.settings import load_train_settings
 from imagine.train.study.outcome import Outcome, read_outcome
 from imagine.train.study.plan import Trial
@@ -63,16 +63,7 @@ class StudyFolder:
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Keep other processes from running the same study. Raises InputError where one does already."""
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            lock = (self.path / ".lock").open("w")
-        except OSError as error:
-            raise InputError(f"{self.path}: the study's folder cannot be written: {error.strerror}") from error
-        with lock as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise InputError(f"{self.path}: this study is running already; wait for it, or end it first") from error
+        with locked(self.path, "runs this study; wait for it, or end it first"):
             shutil.rmtree(self.tune, ignore_errors=True)
             try:
                 yield
