@@ -79,6 +79,16 @@ def test_generated_houses_are_not_learned_by_heart() -> None:
     np.testing.assert_array_equal(both.act(env, observation), policy.act(env, observation))
 
 
+def test_rehearsal_gives_levels_that_can_be_known_the_share_that_is_asked_for() -> None:
+    env = ExplorationSettings(levels=("4", "5", "house:1000-1001:60"), level_weights=(1.0, 3.0, 16.0))
+    rehearsed = RehearsalSettings(known_share=0.6, as_designed=0.7).environment(env)
+    assert rehearsed.level_weights == pytest.approx((0.15, 0.45, 0.2, 0.2))
+    assert rehearsed.as_designed == 0.7
+    assert len(rehearsed.levels) == 4
+    alone = env.model_copy(update={"levels": ("4", "5"), "level_weights": (1.0, 3.0)})
+    assert RehearsalSettings(known_share=0.6).environment(alone).level_weights == (1.0, 3.0)
+
+
 def test_of_worlds_that_nobody_asks_for_it_says_nothing() -> None:
     env, pilot = worlds("2", 3), baseline("clairvoyant", 0)
     observation = env.reset()

@@ -33,7 +33,7 @@ def holder(tmp_path):
 
 def test_a_second_process_is_refused_and_told_who_is_there(tmp_path, holder):
     with (
-        pytest.raises(InputError, match=rf"run: process {holder.pid} is at work$"),
+        pytest.raises(InputError, match=rf"run: process {holder.pid} is here$"),
         locked(tmp_path / "run", "is here"),
     ):
         pytest.fail("two hold the same folder")

@@ -187,29 +187,6 @@ def test_a_rehearsed_policy_is_not_rehearsed_on(rehearsed, tmp_path):
         train(None, ("rehearsal.agent_steps=768",), resume=copy)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            ("rehearsal.agent_steps=9", "rehearsal.level_weights=[1, 2, 3, 4, 5]"),
-            r"rehearsal\.level_weights: give one weight for each",
-        ),
-        (
-            (
-                "rehearsal.agent_steps=9",
-                "rehearsal.level_weights=[1]",
-                "curriculum.mode=parallel",
-                "curriculum.lessons=[{levels: ['0']}]",
-            ),
-            "shares",
-        ),
-    ],
-)
-def test_shares_of_levels_that_no_rehearsal_could_have_are_refused_before_anything_is_learned(changes, message):
-    with pytest.raises(InputError, match=message):
-        load_train_settings(Path("smoke"), changes)
-
-
 def test_what_is_learned_and_what_is_flown_may_decide_at_other_intervals(tmp_path, monkeypatch):
     flown_in = []
     monkeypatch.setattr(
