@@ -70,9 +70,11 @@ def test_draws_are_of_the_space_the_same_for_the_same_seed_and_for_all_repeats()
     assert plan_trials(study(**wanted, seed=1))[0].parameters != trials[0].parameters
 
 
-def test_a_study_stops_its_trials_at_so_many_steps_of_both_phases():
+def test_a_study_stops_its_trials_at_so_many_steps_of_both_phases_without_rehearsal():
+    rehearsed = ["rehearsal.agent_steps=5000"]
+    assert total_steps(plan_trials(study(set=rehearsed))[0].settings) > 5000
     for steps, imitated in ((2000, 512), (300, 300)):
-        settings = plan_trials(study(stop={"agent_steps": steps}))[0].settings
+        settings = plan_trials(study(set=rehearsed, stop={"agent_steps": steps}))[0].settings
         assert (settings.imitation.agent_steps, settings.ppo.agent_steps) == (imitated, steps - imitated)
         assert total_steps(settings) == steps
 

@@ -88,7 +88,7 @@ def _trial(
 
 
 def _stopped_at(settings: TrainSettings, agent_steps: int | None) -> TrainSettings:
-    """Return settings that end at so many agent-steps of both phases, imitation first."""
+    """Return settings that end at so many agent-steps of imitation and PPO, the first first; without rehearsal."""
     if agent_steps is None:
         return settings
     imitated = min(settings.imitation.agent_steps, agent_steps)
@@ -96,13 +96,14 @@ def _stopped_at(settings: TrainSettings, agent_steps: int | None) -> TrainSettin
         update={
             "imitation": settings.imitation.model_copy(update={"agent_steps": imitated}),
             "ppo": settings.ppo.model_copy(update={"agent_steps": agent_steps - imitated}),
+            "rehearsal": settings.rehearsal.model_copy(update={"agent_steps": 0}),
         }
     )
 
 
 def total_steps(settings: TrainSettings) -> int:
     """Return the agent-steps after which a trial has trained."""
-    return settings.imitation.agent_steps + settings.ppo.agent_steps
+    return settings.imitation.agent_steps + settings.ppo.agent_steps + settings.rehearsal.agent_steps
 
 
 def _short(value: Any) -> str:

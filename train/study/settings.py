@@ -85,7 +85,7 @@ class Stop(Settings):
     """When a trial has trained enough."""
 
     agent_steps: int | None = Field(
-        default=None, ge=1, description="of all phases together; none: as the configuration says"
+        default=None, ge=1, description="of imitation and PPO together, without rehearsal; none: as configured"
     )
 
 
