@@ -20,7 +20,7 @@ BASELINES: dict[str, Callable[[int], Pilot]] = {
     "hungarian": lambda seed: FrontierPilot("hungarian", HUNGARIAN, "hungarian"),
     "clairvoyant": ClairvoyantPilot,
 }
-"""What makes each baseline, given a seed; only chance uses it."""
+"""What makes each baseline, given a seed; only chance, and the search for clairvoyant plans, use it."""
 
 
 def baseline(name: str, seed: int) -> Pilot:

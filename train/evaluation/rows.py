@@ -88,7 +88,7 @@ def paired(
 
     `t90_ratio` is the ratio of the mean T90s, own per reference's; differences are own less the reference's, means over
     pairs; means count every level alike. Intervals are 95 % percentile bootstrap intervals over resampled pairs, drawn
-    level by level.
+    as in `bootstrap_interval`.
     """
     sizes = [len(flown) for flown in levels]
     episodes, others = ([episode for flown in both for episode in flown] for both in (levels, reference))
