@@ -109,7 +109,7 @@ def check_same_network(checkpoint: Checkpoint, settings: TrainSettings, where: s
     ):
         for name in type(saved).model_fields:
             has, needs = getattr(saved, name), getattr(wanted, name)
-            if has != needs and name != "log_std":  # that one is where learning began
+            if has != needs and name not in ("log_std", "choice_momentum"):  # no matter of the weights' shape and sense
                 raise InputError(
                     f"{where}: made for another network: {group}.{name} is {has} in it, {needs} here; "
                     "leave the setting as it was, or train anew"

@@ -28,11 +28,13 @@ class Learner:
 
     @staticmethod
     def create(settings: TrainSettings) -> Learner:
-        """Return a fresh learner; the seed decides its weights and draws."""
+        """Return a fresh learner, of imitation and PPO; the seed decides its weights and draws."""
         torch.manual_seed(settings.run.seed)  # layers initialise from the global generator
         observation, action = settings.env.observation, settings.env.action
         device = chosen_device(settings.run.device)
         actor = Actor(settings.network, observation, action.size, steers(observation, action)).to(device)
+        if settings.ppo.choice_momentum is not None:
+            actor.set_momentum(settings.ppo.choice_momentum)
         critic = Critic(settings.network, observation).to(device)
         return Learner(
             actor,

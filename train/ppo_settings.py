@@ -17,6 +17,10 @@ class PpoSettings(Settings):
         default=None, ge=1, le=100,
         description="ticks that a decision stands for in imitation and PPO; none: as in flight, env.action's",
     )  # fmt: skip
+    choice_momentum: float | None = Field(
+        default=None, ge=0.0, le=20.0,
+        description="in imitation and PPO, where chance stays with a choice as well; none: network.choice_momentum",
+    )  # fmt: skip
     rollout_steps: int = Field(default=64, ge=2, description="steps of every world between two updates")
     epochs: int = Field(default=2, ge=1, description="passes over a rollout; more drift from the policy that flew it")
     minibatch: int = Field(default=1152, ge=2, description="samples a gradient step, about; a quarter of 24 x 64 x 3")

@@ -214,6 +214,7 @@ class Trainer:
         as_flown = self.curriculum.environment.model_copy(update={"action": self.settings.env.action})
         environment = settings.environment(as_flown)
         env = Exploration(environment, run.seed + _REHEARSAL_SEED)
+        learner.actor.set_momentum(self.settings.network.choice_momentum)
         self.episodes = RecentEpisodes(environment.episode_ticks, self.curriculum.levels, environment.stop_coverage)
         teacher = RehearsalPilot(
             PolicyPilot(policy_of(copy.deepcopy(learner.actor), run.name, environment)),
@@ -368,6 +369,7 @@ class Trainer:
             if self._stop.is_set():
                 raise _BrokenOff
 
+        self.learner.actor.set_momentum(settings.network.choice_momentum)
         rows = evaluate(
             policy_of(self.learner.actor, settings.run.name, settings.env),
             levels=evaluated_levels(self.curriculum.levels),

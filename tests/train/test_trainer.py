@@ -14,7 +14,7 @@ from imagine.core.errors import InputError
 from imagine.sim import level as sim_level
 from imagine.sim.exploration import Exploration
 from imagine.train import trainer
-from imagine.train.checkpoint import load_checkpoint
+from imagine.train.checkpoint import actor_of, load_checkpoint
 from imagine.train.evaluation import evaluate
 from imagine.train.learner import Learner
 from imagine.train.policies import load_policy
@@ -296,3 +296,18 @@ def test_the_files_of_all_lessons_decide_how_episodes_are_grouped(tmp_path):
         Path("smoke"), overrides(tmp_path, "curriculum.mode=parallel", f"curriculum.lessons={lessons}")
     )
     assert Trainer(settings).episodes.group_of("plan3") == "files"
+
+
+def test_a_choice_is_held_to_by_other_weights_while_it_is_learned_and_when_it_is_flown(tmp_path):
+    choice = ("network.head=choice", "env.observation.frontiers=4")
+    momentum = ("network.choice_momentum=5", "ppo.choice_momentum=1")
+    held = {}
+
+    def look(report):
+        held[report.phase] = run.learner.actor.choice.momentum
+
+    settings = load_train_settings(Path("smoke"), overrides(tmp_path, *REHEARSED, *choice, *momentum))
+    run = Trainer(settings)
+    run.run(RunFolder.create(settings), look, threading.Event())
+    assert held == {"imitation": 1.0, "ppo": 1.0, "rehearsal": 5.0}
+    assert actor_of(load_checkpoint(tmp_path / settings.run.name), "it").choice.momentum == 5.0

@@ -100,6 +100,11 @@ class Actor(Computing):
         """Whether it decides for a whole team by what the whole team sees."""
         return self.paradigm == "ctce"
 
+    def set_momentum(self, momentum: float) -> None:
+        """Let a choice be held to by so much, see `ChoiceHead`; without that head it is nothing."""
+        if self.choice is not None:
+            self.choice.momentum = momentum
+
     def forward(self, *inputs: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Return the action's mean, `[batch, action size]` in (-1, 1), and the next state where there is a memory.
 

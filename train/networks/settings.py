@@ -38,7 +38,7 @@ class NetworkSettings(Settings):
     )
     choice_momentum: float = Field(
         default=2.0, ge=0.0, le=20.0,
-        description="of the head choice: what the score of a frontier gains where the drone flies its way already",
+        description="in flight, of the head choice: what the score of a frontier gains where the drone flies its way",
     )  # fmt: skip
     memory: MemoryKind = Field(
         default="none", description="of the actor: a gated recurrent unit, or the newest views through 3-D convolutions"
