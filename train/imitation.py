@@ -23,6 +23,7 @@ from imagine.train.pilots import Pilot
 from imagine.train.rollout import Recall, agent_tensors, env_actions, estimates, living, next_decisions, stored
 
 _SAME_WAY = 0.03  # of 1 - cosine: directions up to about 10 degrees apart count as one
+_BY_REFERENCE = "by_reference"
 _ALONG = 0.7  # cosine from which on a label points at a frontier
 
 
@@ -109,7 +110,8 @@ def collect_labels(
                 if flown is not None:
                     flown.add(seen, labels, alive, recall.starts)
                 elif isinstance(buffer, LabelBuffer):
-                    buffer.add({key: value[labelled] for key, value in seen.items()}, labels[labelled])
+                    known = {**seen, _BY_REFERENCE: _by_reference(teacher, env).to(actor.device)}
+                    buffer.add({key: value[labelled] for key, value in known.items()}, labels[labelled])
             decisions = next_decisions(actor, {**seen, "alive": alive.to(actor.device)}, recall, env.drones)
             actions = decisions.mean.cpu()
             if student_draws:
@@ -129,6 +131,12 @@ def collect_labels(
     return observation, episodes, added
 
 
+def _by_reference(teacher: Pilot, env: Exploration) -> Tensor:
+    """Return 1 where a drone was labelled by the reference, `[agents, 1]`, as `by_reference` of the teacher tells."""
+    told = getattr(teacher, "by_reference", np.zeros(env.worlds, np.bool_))
+    return torch.from_numpy(np.repeat(told, env.drones)[:, None].astype(np.float32))
+
+
 def imitation_loss(mean: Tensor, labels: Tensor, cosine_weight: float) -> Tensor:
     """Return the mean square error, plus the weighted mean of 1 - cos of the angle to labels longer than 0.1."""
     error = (mean - labels).square().sum(dim=1).mean()
@@ -139,16 +147,20 @@ def imitation_loss(mean: Tensor, labels: Tensor, cosine_weight: float) -> Tensor
     return error + cosine_weight * (1.0 - cosine).mean()
 
 
-def choice_loss(scores: Tensor, frontiers: Tensor, labels: Tensor) -> Tensor:
-    """Return the cross-entropy of choices to the frontiers that lie in the direction of the labels.
+def wanted_choices(frontiers: Tensor, labels: Tensor) -> Tensor:
+    """Return which of the frontiers labels point at, `[rows, n]`: shares that add up to 1, or zeros where at none.
 
-    `scores` `[rows, n]`, `frontiers` `[rows, n, numbers]`, `labels` `[rows, action size]`. Frontiers that begin with
-    the same way are one to a label, so its weight is shared among them; labels that point at none count for nothing.
+    `frontiers` `[rows, n, numbers]`, `labels` `[rows, action size]`. Frontiers that begin with the same way are one to a
+    label, so its weight is shared among them.
     """
     frontiers, labels = frontiers.float(), labels[:, None, :2]
     cosine = nn.functional.cosine_similarity(frontiers[..., 1:3], labels, dim=2, eps=1e-3)
     cosine = torch.where(frontiers[..., 0] > 0.5, cosine, -1.0)
-    wanted = torch.softmax((cosine - 1.0) / _SAME_WAY, dim=1) * (cosine.amax(dim=1, keepdim=True) > _ALONG)
+    return torch.softmax((cosine - 1.0) / _SAME_WAY, dim=1) * (cosine.amax(dim=1, keepdim=True) > _ALONG)
+
+
+def choice_loss(scores: Tensor, wanted: Tensor) -> Tensor:
+    """Return the cross-entropy of choices by `scores` to the `wanted` ones, `[rows, n]`; rows of zeros do not count."""
     loss = -(wanted * torch.log_softmax(scores, dim=1)).sum(dim=1)
     return loss.sum() / wanted.sum().clamp(min=1.0)
 
@@ -159,22 +171,32 @@ def learn(
     buffer: LabelBuffer | RoundBuffer,
     settings: LabelSettings,
     generator: torch.Generator,
+    reference: Actor | None = None,
 ) -> float:
     """Take a round's gradient steps toward the labels; return the mean loss, nan where there is no label yet.
 
+    Of states that the teacher's `by_reference` told of, all scores of `reference` are learned, and not its best alone: how much
+    lies between it and the next is what holds elsewhere.
     Raises WorkError where a loss or gradient is not finite, before it reaches the weights.
     """
     if not len(buffer):
         return math.nan
     losses = []
-    with at_precision(settings.precision, actor):
+    guides = [] if reference is None or not isinstance(buffer, LabelBuffer) else [reference]
+    with at_precision(settings.precision, actor, *guides):
         for _ in range(settings.gradient_steps):
             batch = buffer.sample(settings.minibatch, generator)
             decisions, labels = batch.decide(actor), batch["labels"]
             if decisions.scores is None:
                 loss = imitation_loss(batch.of_counted(decisions.mean), labels, settings.cosine_weight)
             else:
-                loss = choice_loss(batch.of_counted(decisions.scores), batch["frontiers"], labels)
+                wanted = wanted_choices(batch["frontiers"], labels)
+                for guide in guides:
+                    with torch.no_grad():
+                        told = batch.decide(guide).scores
+                    assert told is not None
+                    wanted = torch.where(batch[_BY_REFERENCE] > 0.5, torch.softmax(told, dim=1), wanted)
+                loss = choice_loss(batch.of_counted(decisions.scores), wanted)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             norm = float(nn.utils.clip_grad_norm_(actor.parameters(), 1.0))

@@ -76,6 +76,8 @@ class RehearsalPilot:
         """Make a pilot that has yet to begin."""
         self._pilots = policy, at_launch_point, late
         self._late_coverage = late_coverage
+        self.by_reference: NDArray[np.bool_] = np.zeros(0, np.bool_)
+        """Whose worlds the policy advised last, `[worlds]`."""
 
     def begin(self, env: Exploration) -> None:
         """Let all begin."""
@@ -92,6 +94,7 @@ class RehearsalPilot:
         late = env.maps.coverage() >= self._late_coverage
         houses = [level.name.startswith(PREFIX) for level in env.twin.levels]
         designed = env.as_designed & ~late & ~np.array(houses)
+        self.by_reference = ~late & ~designed
         wanted = np.ones(env.worlds, np.bool_) if worlds is None else worlds
         actions = np.full((env.worlds, env.drones, env.settings.action.size), np.nan, np.float32)
         for pilot, its in zip(self._pilots, (~late & ~designed, designed, late), strict=True):

@@ -27,6 +27,7 @@ from imagine.train.evaluation import evaluate
 from imagine.train.folder_lock import locked
 from imagine.train.imitation import LabelSettings, collect_labels, label_buffer, learn
 from imagine.train.learner import Learner
+from imagine.train.networks import Actor
 from imagine.train.pilots import Pilot
 from imagine.train.policies import PolicyPilot, policy_of
 from imagine.train.ppo import update
@@ -216,20 +217,21 @@ class Trainer:
         env = Exploration(environment, run.seed + _REHEARSAL_SEED)
         learner.actor.set_momentum(self.settings.network.choice_momentum)
         self.episodes = RecentEpisodes(environment.episode_ticks, self.curriculum.levels, environment.stop_coverage)
+        before = copy.deepcopy(learner.actor)
         teacher = RehearsalPilot(
-            PolicyPilot(policy_of(copy.deepcopy(learner.actor), run.name, environment)),
+            PolicyPilot(policy_of(before, run.name, environment)),
             baseline(settings.launch_point_teacher, run.seed), baseline(settings.late_teacher, run.seed),
             settings.late_coverage,
         )  # fmt: skip
         learner.imitation.state.clear()
         recall = Recall.nothing(learner.actor, env.worlds * env.drones)
-        self._learn_labels(env, env.reset(), recall, teacher, settings, settings.agent_steps)
+        self._learn_labels(env, env.reset(), recall, teacher, settings, settings.agent_steps, before)
         self._source = None
         self._last = None if self._stop.is_set() else self.checkpoint()
 
     def _learn_labels(
         self, env: Exploration, observation: Observation, recall: Recall, teacher: Pilot, settings: LabelSettings,
-        agent_steps: int,
+        agent_steps: int, reference: Actor | None = None,
     ) -> Observation:  # fmt: skip
         """Gather labels and learn from them, round after round, until there are so many; return what is seen then."""
         learner, phase = self.learner, self.phase
@@ -247,7 +249,7 @@ class Trainer:
             collected = time.monotonic()
             for group in learner.imitation.param_groups:
                 group["lr"] = settings.lr * (1.0 - (1.0 - settings.final_lr_share) * done_share)
-            loss = learn(learner.actor, learner.imitation, buffer, settings, learner.generator)
+            loss = learn(learner.actor, learner.imitation, buffer, settings, learner.generator, reference)
             steps = settings.round_steps * env.worlds * env.drones
             numbers = {"loss": loss, "planner_share": planner_share, "labelled_share": labels / steps}
             seconds = {"collect": collected - began, "learn": time.monotonic() - collected}

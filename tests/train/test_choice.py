@@ -6,9 +6,12 @@ import pytest
 import torch
 
 from imagine.core.observation_spec import ObservationSpec
+from imagine.train.imitation import learn
+from imagine.train.labels import LabelBuffer
 from imagine.train.networks import Actor, Critic, NetworkSettings
 from imagine.train.networks.choice import choice_entropy, choice_log_probability, draw_choice, has_choice
 from imagine.train.ppo import Optimisers, PpoSettings, update
+from imagine.train.rehearsal import RehearsalSettings
 from imagine.train.rollout import Rollout
 
 SPEC = ObservationSpec(view_cells=16, lidar_sectors=16, frontiers=4)
@@ -137,3 +140,29 @@ def test_where_nothing_else_speaks_for_one_the_frontier_that_it_flies_to_already
     assert scores.argmax(dim=1).tolist() == [1, 2, 0]
     torch.testing.assert_close(scores[1, 2] - scores[1, 0], torch.tensor(SMALL.choice_momentum))
     assert (scores[:, 3] < scores[:, :3].amin(dim=1)).all()
+
+
+def test_of_what_the_reference_labelled_all_of_its_scores_are_learned():
+    torch.manual_seed(3)
+    reference = Actor(SMALL, SPEC, 2)
+    with torch.no_grad():
+        reference.choice.score.weight.mul_(8.0)
+    seen = {key: torch.rand((400, *shape)) for key, shape in SPEC.shapes.items()}
+    seen["frontiers"][..., 0] = 1.0
+    seen["frontiers"][..., 1:3] = torch.nn.functional.normalize(torch.randn(400, 4, 2), dim=2)
+    with torch.no_grad():
+        wanted = reference.decide(seen)
+    apart = {}
+    for by_reference in (0.0, 1.0):
+        torch.manual_seed(4)
+        actor, generator = Actor(SMALL, SPEC, 2), torch.Generator().manual_seed(0)
+        buffer = LabelBuffer(400)
+        buffer.add({**seen, "by_reference": torch.full((400, 1), by_reference)}, wanted.mean)
+        settings = RehearsalSettings(gradient_steps=150, minibatch=100, precision="float32")
+        learn(actor, torch.optim.Adam(actor.parameters(), 3e-3), buffer, settings, generator, reference)
+        with torch.no_grad():
+            found = torch.log_softmax(actor.decide(seen).scores, dim=1)
+        apart[by_reference] = float(
+            torch.nn.functional.kl_div(found, torch.softmax(wanted.scores, dim=1), reduction="batchmean")
+        )
+    assert apart[1.0] < 0.5 * apart[0.0]
