@@ -150,8 +150,8 @@ def imitation_loss(mean: Tensor, labels: Tensor, cosine_weight: float) -> Tensor
 def wanted_choices(frontiers: Tensor, labels: Tensor) -> Tensor:
     """Return which of the frontiers labels point at, `[rows, n]`: shares that add up to 1, or zeros where at none.
 
-    `frontiers` `[rows, n, numbers]`, `labels` `[rows, action size]`. Frontiers that begin with the same way are one to a
-    label, so its weight is shared among them.
+    `frontiers` `[rows, n, numbers]`, `labels` `[rows, action size]`. Frontiers that begin with the same way are one to
+    a label, so its weight is shared among them.
     """
     frontiers, labels = frontiers.float(), labels[:, None, :2]
     cosine = nn.functional.cosine_similarity(frontiers[..., 1:3], labels, dim=2, eps=1e-3)
@@ -175,9 +175,8 @@ def learn(
 ) -> float:
     """Take a round's gradient steps toward the labels; return the mean loss, nan where there is no label yet.
 
-    Of states that the teacher's `by_reference` told of, all scores of `reference` are learned, and not its best alone: how much
-    lies between it and the next is what holds elsewhere.
-    Raises WorkError where a loss or gradient is not finite, before it reaches the weights.
+    Of states that the teacher's `by_reference` told of, all scores of `reference` are learned, and not its best alone:
+    how much lies between it and the next is what holds elsewhere. Raises WorkError where a loss or gradient is not finite, before it reaches the weights.
     """
     if not len(buffer):
         return math.nan
