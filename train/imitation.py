@@ -176,7 +176,8 @@ def learn(
     """Take a round's gradient steps toward the labels; return the mean loss, nan where there is no label yet.
 
     Of states that the teacher's `by_reference` told of, all scores of `reference` are learned, and not its best alone:
-    how much lies between it and the next is what holds elsewhere. Raises WorkError where a loss or gradient is not finite, before it reaches the weights.
+    how much lies between it and the next is what holds elsewhere. Raises WorkError where a loss or gradient is not
+    finite, before it reaches the weights.
     """
     if not len(buffer):
         return math.nan
