@@ -233,7 +233,7 @@ def train(
 
     from imagine.kernel_cache import announce_compiling
     from imagine.train.report import LiveReporter, LogReporter, Reporter
-    from imagine.train.trainer import train as run_training
+    from imagine.train.run import train as run_training
 
     announce_compiling(lambda text: print(text, file=sys.stderr))
     console = Console()

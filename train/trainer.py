@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import copy
-import json
 import logging
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,13 +17,10 @@ import torch
 
 from imagine.core.errors import InputError, WorkError
 from imagine.sim.exploration import Exploration, Observation
-from imagine.sim.generator import PREFIX
-from imagine.train.atomic_file import write_atomically
 from imagine.train.baselines import baseline
-from imagine.train.checkpoint import PHASES, Checkpoint, Phase, check_same_network, load_checkpoint
+from imagine.train.checkpoint import PHASES, Checkpoint, Phase, check_same_network
 from imagine.train.curriculum import Curriculum
-from imagine.train.evaluation import evaluate
-from imagine.train.folder_lock import locked
+from imagine.train.final_evaluation import write_final_evaluation
 from imagine.train.imitation import LabelSettings, collect_labels, label_buffer, learn
 from imagine.train.learner import Learner
 from imagine.train.networks import Actor
@@ -32,20 +28,13 @@ from imagine.train.pilots import Pilot
 from imagine.train.policies import PolicyPilot, policy_of
 from imagine.train.ppo import update
 from imagine.train.rehearsal import RehearsalPilot
-from imagine.train.report import LogReporter, RecentEpisodes, Report, Reporter
+from imagine.train.report import RecentEpisodes, Report, Reporter
 from imagine.train.rollout import Recall
 from imagine.train.rollout_source import OwnRollouts, RolloutSource
 from imagine.train.run_folder import RunFolder, run_record
-from imagine.train.settings import TrainSettings, load_train_settings
-from imagine.train.stopping import stop_requests
+from imagine.train.settings import TrainSettings
 
 logger = logging.getLogger(__name__)
-
-_MOST_HOUSES = 5
-
-
-class _BrokenOff(Exception):
-    """Whoever waits for the final evaluation has asked for an end."""
 
 
 @dataclass(frozen=True)
@@ -59,52 +48,7 @@ class RunResult:
     levels: dict[str, dict[str, float]]
 
 
-_BUSY = "is training in this folder; wait for it, end it, or take another name with --set run.name=…"
 _REHEARSAL_SEED = 7_000_003  # other worlds than PPO's
-
-
-def train(
-    config: Path | None,
-    overrides: tuple[str, ...] = (),
-    resume: Path | None = None,
-    report: Reporter | None = None,
-) -> RunResult:
-    """Run a training from a configuration, or go on with the run in the folder `resume`.
-
-    SIGINT and SIGTERM end it cleanly after the update in progress, with a checkpoint. Raises InputError for bad
-    settings or checkpoints and where another process trains in the folder, WorkError when training diverges or the disk
-    is full.
-    """
-    if resume is None:
-        settings = load_train_settings(config, overrides)
-        trainer = Trainer(settings)
-        with locked(Path(settings.run.root) / settings.run.name, _BUSY):
-            return _run(trainer, RunFolder.create(settings), report)
-    if config is not None:
-        raise InputError("a resumed run has its configuration already: give CONFIG or --resume, not both")
-    run = resume if resume.is_dir() else resume.parent.parent
-    if not (resume.exists() and (run / "config.yaml").exists()):
-        raise InputError(f"--resume {resume}: no run to go on with: give a run's folder, or a checkpoint in one")
-    with locked(run, _BUSY):  # before the checkpoint is read: whoever trained here until now may have left a newer one
-        settings = load_train_settings(run / "config.yaml", overrides)
-        checkpoint = None if _is_before_its_first_checkpoint(resume) else load_checkpoint(resume)
-        trainer = Trainer(settings, checkpoint)
-        steps = 0 if checkpoint is None else sum(checkpoint.agent_steps.values())
-        return _run(trainer, RunFolder.reopen(run, steps, settings), report)
-
-
-def _run(trainer: Trainer, folder: RunFolder, report: Reporter | None) -> RunResult:
-    """Train until the end, or until the process is told to stop."""
-    try:
-        with stop_requests() as stop:
-            return trainer.run(folder, report or LogReporter(), stop)
-    finally:
-        folder.close()
-
-
-def _is_before_its_first_checkpoint(resume: Path) -> bool:
-    """Tell whether a run's folder holds no checkpoint yet: it was stopped while it imitated, and begins anew."""
-    return (resume / "config.yaml").exists() and not (resume / "checkpoints" / "latest.pt").exists()
 
 
 @dataclass
@@ -188,10 +132,10 @@ class Trainer:
         if self._last is not None:
             checkpoint = folder.save(self._last, "final" if finished else None)
         if finished and self.settings.run.final_episodes:
-            try:
-                self._evaluate(checkpoint)
-            except _BrokenOff:
-                logger.warning("trained to the end; its evaluation was broken off: imagine evaluate makes up for it")
+            self.learner.actor.set_momentum(self.settings.network.choice_momentum)
+            policy = policy_of(self.learner.actor, self.settings.run.name, self.settings.env)
+            told = {"checkpoint": checkpoint.name, "agent_steps": self.agent_steps}
+            write_final_evaluation(folder.path, policy, self.settings, self.curriculum.levels, told, stop)
         return RunResult(folder.path, checkpoint, sum(self.agent_steps.values()), finished, self.episodes.means())
 
     def _imitate(self) -> None:
@@ -359,36 +303,5 @@ class Trainer:
             record={**run_record(self.settings), "levels": self.episodes.summary()},
         )
 
-    def _evaluate(self, checkpoint: Path) -> None:
-        """Evaluate the finished policy on every level and write the rows beside the checkpoints.
-
-        Episodes end as in `imagine evaluate`, though those of the training may have ended sooner (env.stop_coverage).
-        Raises _BrokenOff before the next level once `_stop` is set.
-        """
-        settings = self.settings
-
-        def go_on(_level: str) -> None:
-            if self._stop.is_set():
-                raise _BrokenOff
-
-        self.learner.actor.set_momentum(settings.network.choice_momentum)
-        rows = evaluate(
-            policy_of(self.learner.actor, settings.run.name, settings.env),
-            levels=evaluated_levels(self.curriculum.levels),
-            drones=(settings.env.drones,),
-            protocol=settings.env.protocol,
-            episodes=settings.run.final_episodes,
-            seed=settings.run.seed + 1,
-            progress=go_on,
-        )
-        text = json.dumps({"checkpoint": checkpoint.name, "agent_steps": self.agent_steps, "rows": rows}, indent=2)
-        write_atomically(self._folder.path / "evaluation.json", lambda file: file.write_text(text + "\n", "utf-8"))
-
     def _wall_s(self) -> float:
         return self._wall_before_s + time.monotonic() - self._began
-
-
-def evaluated_levels(levels: Sequence[str]) -> list[str]:
-    """Return those of a run's levels that are flown at its end: all, but of generated houses only the first few."""
-    houses = [level for level in levels if level.startswith(PREFIX)]
-    return sorted({level for level in levels if level not in houses} | set(houses[:_MOST_HOUSES]))

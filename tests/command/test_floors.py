@@ -80,7 +80,7 @@ def test_the_tests_import_parts_as_users_do() -> None:
         "import imagine.sim.twin",
         "from imagine.sim import twin",
         "from imagine import sim",
-        "def f():\n    from imagine.train.trainer import train",
+        "def f():\n    from imagine.train.run import train",
         "import core",
         "from core.frames import Pose",
         "from ..core import frames",

@@ -12,8 +12,9 @@ from imagine.core.errors import InputError
 from imagine.sim.level import BUILT_IN, load_level
 from imagine.train.checkpoint import load_checkpoint
 from imagine.train.curriculum import Curriculum
+from imagine.train.run import train
 from imagine.train.settings import load_train_settings
-from imagine.train.trainer import Trainer, train
+from imagine.train.trainer import Trainer
 
 TINY = (
     "env.worlds=2", "env.episode_ticks=40", "env.observation.view_cells=16", "env.observation.lidar_sectors=16",

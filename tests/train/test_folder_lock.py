@@ -9,7 +9,7 @@ import pytest
 
 from imagine.core.errors import InputError
 from imagine.train.folder_lock import locked
-from imagine.train.trainer import train
+from imagine.train.run import train
 
 HOLD = """
 import sys

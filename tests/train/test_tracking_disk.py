@@ -12,9 +12,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from imagine.core.errors import WorkError
 from imagine.train.atomic_file import append_whole
 from imagine.train.checkpoint import load_checkpoint
+from imagine.train.run import train
 from imagine.train.tracking.json_lines import JsonLinesTracker, drop_after, read_rows
 from imagine.train.tracking.tensorboard_events import TensorBoardTracker
-from imagine.train.trainer import train
 
 FULL = Path("/dev/full")
 DISK_BYTES = 32_000_000

@@ -12,9 +12,9 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from imagine.core.errors import InputError
+from imagine.train.run import train
 from imagine.train.settings import load_train_settings
 from imagine.train.tracking.curves import plot_run, read_curves, smoothed
-from imagine.train.trainer import train
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "tracking.md"
 OVERRIDES = (

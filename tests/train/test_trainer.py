@@ -20,10 +20,11 @@ from imagine.train.learner import Learner
 from imagine.train.policies import load_policy
 from imagine.train.ppo import update
 from imagine.train.rollout import collect
+from imagine.train.run import train
 from imagine.train.run_folder import RunFolder
 from imagine.train.settings import load_train_settings
 from imagine.train.tracking.level_groups import MOST_FILES
-from imagine.train.trainer import Trainer, train
+from imagine.train.trainer import Trainer
 
 TINY = (
     "env.worlds=2", "env.episode_ticks=40", "env.observation.view_cells=16", "env.observation.lidar_sectors=16",

@@ -22,6 +22,7 @@ from imagine.train.atomic_file import write_atomically
 from imagine.train.checkpoint import load_checkpoint
 from imagine.train.report import Report
 from imagine.train.rollout_workers import RolloutWorkerLost
+from imagine.train.run import train
 from imagine.train.study.outcome import (
     Outcome,
     Status,
@@ -33,7 +34,6 @@ from imagine.train.study.outcome import (
     rewrite_told,
     write_outcome,
 )
-from imagine.train.trainer import train
 
 METRICS = ("coverage", "t90", "contacts")
 """What trials are compared by: of episodes, means by level."""
