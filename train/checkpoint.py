@@ -100,8 +100,19 @@ def load_weights(network: nn.Module, weights: dict[str, Tensor], where: str) -> 
     network.load_state_dict(weights)
 
 
+_NOT_OF_THE_WEIGHTS = ("log_std", "choice_momentum", "decision_ticks")
+"""Where learning began, and what is of flight alone."""
+
+
 def check_same_network(checkpoint: Checkpoint, settings: TrainSettings, where: str) -> None:
-    """Raise InputError naming the first setting of the networks in which a checkpoint differs from a run."""
+    """Raise InputError naming the first setting in which a checkpoint's networks, or how they learn, are others."""
+    was = checkpoint.settings
+    for key, has, needs in (
+        ("ppo.decision_ticks", was.practice.action.decision_ticks, settings.practice.action.decision_ticks),
+        ("ppo.choice_momentum", was.practice_momentum, settings.practice_momentum),
+    ):
+        if has != needs:
+            raise InputError(f"{where}: learned with {key} {has}, not {needs}: leave it as it was, or begin a new run")
     for group, saved, wanted in (
         ("network", checkpoint.settings.network, settings.network),
         ("env.observation", checkpoint.settings.env.observation, settings.env.observation),
@@ -109,7 +120,7 @@ def check_same_network(checkpoint: Checkpoint, settings: TrainSettings, where: s
     ):
         for name in type(saved).model_fields:
             has, needs = getattr(saved, name), getattr(wanted, name)
-            if has != needs and name not in ("log_std", "choice_momentum"):  # no matter of the weights' shape and sense
+            if has != needs and name not in _NOT_OF_THE_WEIGHTS:
                 raise InputError(
                     f"{where}: made for another network: {group}.{name} is {has} in it, {needs} here; "
                     "leave the setting as it was, or train anew"

@@ -57,7 +57,7 @@ class ImitationSettings(LabelSettings):
     teacher: Teacher = Field(
         default="coordinated", description="the planner whose advice labels the states that are visited"
     )
-    agent_steps: int = Field(default=250_000, ge=0, description="labelled decisions; 0 leaves imitation out")
+    agent_steps: int = Field(default=250_000, ge=0, description="decisions of all drones; 0 leaves imitation out")
 
 
 def label_buffer(actor: Actor, samples: int) -> LabelBuffer | RoundBuffer:
@@ -85,8 +85,8 @@ def collect_labels(
 ) -> tuple[Observation, list[EpisodeMetrics], int]:
     """Fly `steps` in all worlds and label states; return the next observation, finished episodes and labels added.
 
-    Every `label_every`-th state is labelled, and until the next what the planner flies keeps its way. Which drones it
-    flies is drawn once a call, so that the student's own mistakes have time to unfold.
+    Every `label_every`-th state is labelled, and until the next what the planner flies repeats its action. Which drones
+    it flies is drawn once a call, so that the student's own mistakes have time to unfold.
     `recall` is what the student remembers so far, and is brought up to date; without one everybody's episode begins.
     """
     agents = env.worlds * env.drones
@@ -95,17 +95,16 @@ def collect_labels(
     episodes: list[EpisodeMetrics] = []
     added = 0
     flown = Round.empty(recall) if isinstance(buffer, RoundBuffer) else None
-    every = 1 if actor.state_size else label_every
     labels = torch.full((agents, env.settings.action.size), math.nan)
     with at_precision(precision, actor):
         noise = actor.noise(steps, agents, generator)
         for t in range(steps):
             seen = stored(agent_tensors(observation, actor.is_central), torch.float16, actor.device)
             alive = living(env)
-            if t % every == 0:
+            if t % label_every == 0:
                 labels = torch.from_numpy(teacher.act(env, observation).reshape(agents, -1))
             labelled = torch.isfinite(labels).all(dim=1)
-            if t % every == 0:
+            if t % label_every == 0:
                 added += int(labelled.sum())
                 if flown is not None:
                     flown.add(seen, labels, alive, recall.starts)
@@ -176,8 +175,8 @@ def learn(
     """Take a round's gradient steps toward the labels; return the mean loss, nan where there is no label yet.
 
     Of states that the teacher's `by_reference` told of, all scores of `reference` are learned, and not its best alone:
-    how much lies between it and the next is what holds elsewhere. Raises WorkError where a loss or gradient is not
-    finite, before it reaches the weights.
+    how much lies between it and the next is what holds elsewhere. Policies that remember or are centralised learn the
+    best alone. Raises WorkError where a loss or gradient is not finite, before it reaches the weights.
     """
     if not len(buffer):
         return math.nan

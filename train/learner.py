@@ -33,8 +33,7 @@ class Learner:
         observation, action = settings.env.observation, settings.env.action
         device = chosen_device(settings.run.device)
         actor = Actor(settings.network, observation, action.size, steers(observation, action)).to(device)
-        if settings.ppo.choice_momentum is not None:
-            actor.set_momentum(settings.ppo.choice_momentum)
+        actor.set_momentum(settings.practice_momentum)
         critic = Critic(settings.network, observation).to(device)
         return Learner(
             actor,

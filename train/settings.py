@@ -54,6 +54,22 @@ class TrainSettings(Settings):
         action = self.env.action.model_copy(update={"decision_ticks": ticks})
         return self.env.model_copy(update={"action": action})
 
+    @property
+    def practice_momentum(self) -> float:
+        """What holds a drone to its choice in imitation and PPO."""
+        told = self.ppo.choice_momentum
+        return self.network.choice_momentum if told is None else told
+
+    @model_validator(mode="after")
+    def _memories_count_the_same_decisions(self) -> Self:
+        learned, flown = self.practice.action.decision_ticks, self.env.action.decision_ticks
+        if self.network.memory != "none" and learned != flown:
+            raise ValueError(
+                f"ppo.decision_ticks {learned} is not env.action.decision_ticks, {flown}: a memory counts in "
+                "decisions; set ppo.decision_ticks to null, and env.action.decision_ticks to what is wanted"
+            )
+        return self
+
     @model_validator(mode="after")
     def _choice_has_choices(self) -> Self:
         observation, action = self.env.observation, self.env.action

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import math
 import os
 import threading
 import time
@@ -62,6 +63,8 @@ class Trainer:
     phase: Phase = "imitation"
 
     def __post_init__(self) -> None:
+        if self.resumed is not None:
+            check_same_network(self.resumed, self.settings, "checkpoint")
         self.curriculum = Curriculum(self.settings.curriculum, self.settings.practice)
         if self.resumed is not None:
             self.curriculum.load_state_dict(self.resumed.progress["curriculum"])
@@ -76,7 +79,6 @@ class Trainer:
         self._last: Checkpoint | None = None
         self._take_up(None if self.resumed is None else self.resumed.env)
         if self.resumed is not None:
-            check_same_network(self.resumed, self.settings, "checkpoint")
             self.learner.restore(self.resumed)
             self.agent_steps |= self.resumed.agent_steps
             self.updates, self.phase = self.resumed.updates, self.resumed.phase
@@ -179,6 +181,7 @@ class Trainer:
     ) -> Observation:  # fmt: skip
         """Gather labels and learn from them, round after round, until there are so many; return what is seen then."""
         learner, phase = self.learner, self.phase
+        every = 1 if learner.actor.state_size else settings.label_every
         buffer = label_buffer(learner.actor, settings.buffer_samples)
         teacher.begin(env)
         while self.agent_steps[phase] < agent_steps and not self._stop.is_set():
@@ -188,14 +191,15 @@ class Trainer:
             planner_share = settings.planner_share * max(0.0, 1.0 - done_share / until)
             observation, episodes, labels = collect_labels(
                 env, observation, learner.actor, teacher, buffer, settings.round_steps, planner_share, learner.rng,
-                learner.generator, settings.precision, recall, settings.student_draws, settings.label_every,
+                learner.generator, settings.precision, recall, settings.student_draws, every,
             )  # fmt: skip
             collected = time.monotonic()
             for group in learner.imitation.param_groups:
                 group["lr"] = settings.lr * (1.0 - (1.0 - settings.final_lr_share) * done_share)
             loss = learn(learner.actor, learner.imitation, buffer, settings, learner.generator, reference)
             steps = settings.round_steps * env.worlds * env.drones
-            numbers = {"loss": loss, "planner_share": planner_share, "labelled_share": labels / steps}
+            asked = math.ceil(settings.round_steps / every) * env.worlds * env.drones
+            numbers = {"loss": loss, "planner_share": planner_share, "labelled_share": labels / asked}
             seconds = {"collect": collected - began, "learn": time.monotonic() - collected}
             self._after_update(env, steps, agent_steps, numbers, seconds, episodes)
         return observation

@@ -6,10 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from imagine.core.observation_spec import ObservationSpec
 from imagine.sim.exploration import Exploration
 from imagine.sim.exploration_settings import ExplorationSettings
 from imagine.train.baselines import baseline
+from imagine.train.imitation import collect_labels
+from imagine.train.labels import LabelBuffer
+from imagine.train.networks import Actor, NetworkSettings
 from imagine.train.pilots import Pilot
 from imagine.train.rehearsal import RehearsalPilot, RehearsalSettings
 
@@ -67,6 +72,23 @@ def test_in_rehearsal_each_world_has_the_teacher_for_where_it_began_and_how_far_
     np.testing.assert_array_equal(mixed[~designed & ~late], policy[~designed & ~late])
     assert (designed & ~late).any()
     assert (~designed & ~late).any()
+
+
+def test_labels_tell_whether_the_policy_gave_them() -> None:
+    spec = ObservationSpec(view_cells=16, lidar_sectors=16, frontiers=4)
+    env = worlds("4", 8, random_launch=True, as_designed=0.5, observation=spec)
+    observation = env.reset()
+    designed = np.repeat(env.as_designed, env.drones)
+    pilot = RehearsalPilot(*(baseline(name, 0) for name in ("frontier", "clairvoyant", "coordinated")), 0.95)
+    pilot.begin(env)
+    settings = NetworkSettings(head="choice", view_channels=(8, 8, 8), critic_channels=(8, 8), hidden=32)
+    buffer = LabelBuffer(100)
+    collect_labels(
+        env, observation, Actor(settings, spec, 2), pilot, buffer, 1, 0.0, np.random.default_rng(0),
+        torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    assert len(buffer) == 24
+    np.testing.assert_array_equal(buffer.arrays["by_reference"][:24, 0].numpy() > 0.5, ~designed)
 
 
 def test_generated_houses_are_not_learned_by_heart() -> None:

@@ -130,6 +130,7 @@ def test_a_policy_that_chooses_is_not_told_to_have_a_spread():
 def test_where_nothing_else_speaks_for_one_the_frontier_that_it_flies_to_already_is_kept():
     torch.manual_seed(0)
     actor = Actor(SMALL, SPEC, 2)
+    actor.set_momentum(2.0)
     with torch.no_grad():
         actor.choice.score.weight.zero_()
     seen = {key: torch.zeros((3, *shape)) for key, shape in SPEC.shapes.items()}
@@ -138,7 +139,7 @@ def test_where_nothing_else_speaks_for_one_the_frontier_that_it_flies_to_already
     seen["motion"][:, :2] = torch.tensor([[0.0, 1.0], [-0.5, 0.0], [0.0, 0.0]])
     scores = actor.decide(seen).scores
     assert scores.argmax(dim=1).tolist() == [1, 2, 0]
-    torch.testing.assert_close(scores[1, 2] - scores[1, 0], torch.tensor(SMALL.choice_momentum))
+    torch.testing.assert_close(scores[1, 2] - scores[1, 0], torch.tensor(2.0))
     assert (scores[:, 3] < scores[:, :3].amin(dim=1)).all()
 
 

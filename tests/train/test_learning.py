@@ -245,6 +245,27 @@ def test_between_two_labels_what_the_planner_flies_keeps_its_way():
     assert [round(100 * float(actions[0, 0, 0])) for actions in flown] == [0, 0, 0, 0, 4, 4, 4, 4, 8, 8]
 
 
+def test_a_label_is_not_held_into_the_next_episode():
+    class East:
+        name = "east"
+
+        def forget(self, worlds):
+            pass
+
+        def act(self, env, observation, worlds=None):
+            return np.full((env.worlds, env.drones, 2), [1.0, 0.0], np.float32)
+
+    env = Exploration(ExplorationSettings(levels=("4",), worlds=1, drones=1, episode_ticks=3, observation=SPEC), 0)
+    flown, step = [], env.step
+    env.step = lambda actions: (flown.append(actions[0, 0].copy()), step(actions))[1]
+    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    actor = Actor(SMALL, SPEC, 2)
+    collect_labels(
+        env, env.reset(), actor, East(), LabelBuffer(9), 6, 1.0, rng, generator, student_draws=False, label_every=6
+    )  # fmt: skip
+    assert [bool((action == [1.0, 0.0]).all()) for action in flown] == [True, True, True, False, False, False]
+
+
 def test_the_buffer_keeps_the_newest_labels():
     buffer = LabelBuffer(10)
     for first in range(0, 24, 4):

@@ -1,3 +1,4 @@
+import copy
 import json
 import os
 import shutil
@@ -17,6 +18,7 @@ from imagine.train import trainer
 from imagine.train.checkpoint import actor_of, load_checkpoint
 from imagine.train.evaluation import evaluate
 from imagine.train.learner import Learner
+from imagine.train.networks import Actor
 from imagine.train.policies import load_policy
 from imagine.train.ppo import update
 from imagine.train.rollout import collect
@@ -299,16 +301,55 @@ def test_the_files_of_all_lessons_decide_how_episodes_are_grouped(tmp_path):
     assert Trainer(settings).episodes.group_of("plan3") == "files"
 
 
-def test_a_choice_is_held_to_by_other_weights_while_it_is_learned_and_when_it_is_flown(tmp_path):
-    choice = ("network.head=choice", "env.observation.frontiers=4")
-    momentum = ("network.choice_momentum=5", "ppo.choice_momentum=1")
+CHOICE = (
+    "network.head=choice", "env.observation.frontiers=4", "network.choice_momentum=5", "ppo.choice_momentum=1"
+)  # fmt: skip
+
+
+def test_a_choice_is_held_to_by_other_weights_while_it_is_learned_and_when_it_is_flown(tmp_path, monkeypatch):
     held = {}
 
     def look(report):
         held[report.phase] = run.learner.actor.choice.momentum
 
-    settings = load_train_settings(Path("smoke"), overrides(tmp_path, *REHEARSED, *choice, *momentum))
+    def look_last(*arguments):
+        held["flown"] = run.learner.actor.choice.momentum
+
+    monkeypatch.setattr(trainer, "write_final_evaluation", look_last)
+    settings = load_train_settings(Path("smoke"), (*overrides(tmp_path, *CHOICE), "run.final_episodes=1"))
     run = Trainer(settings)
     run.run(RunFolder.create(settings), look, threading.Event())
-    assert held == {"imitation": 1.0, "ppo": 1.0, "rehearsal": 5.0}
+    assert held == {"imitation": 1.0, "ppo": 1.0, "flown": 5.0}
     assert actor_of(load_checkpoint(tmp_path / settings.run.name), "it").choice.momentum == 5.0
+
+
+def test_in_rehearsal_a_choice_is_held_to_as_in_flight_by_teacher_and_student(tmp_path, monkeypatch):
+    held, copied = {}, copy.deepcopy
+
+    def look(report):
+        held[report.phase] = run.learner.actor.choice.momentum
+
+    def look_at_copies(thing, *more):
+        if isinstance(thing, Actor):
+            held["teacher"] = thing.choice.momentum
+        return copied(thing, *more)
+
+    monkeypatch.setattr(trainer.copy, "deepcopy", look_at_copies)
+    settings = load_train_settings(Path("smoke"), overrides(tmp_path, *REHEARSED, *CHOICE))
+    run = Trainer(settings)
+    run.run(RunFolder.create(settings), look, threading.Event())
+    assert held == {"imitation": 1.0, "ppo": 1.0, "teacher": 5.0, "rehearsal": 5.0}
+
+
+@pytest.mark.parametrize("key", ["ppo.decision_ticks=2", "ppo.choice_momentum=3"])
+def test_a_run_goes_on_learning_as_it_began(finished, tmp_path, key):
+    folder = tmp_path / "run"
+    shutil.copytree(finished[0].folder, folder)
+    name = key.partition("=")[0].replace(".", r"\.")
+    with pytest.raises(InputError, match=rf"^checkpoint: learned with {name} .*leave it as it was, or begin a new run"):
+        train(None, (key, "ppo.agent_steps=640"), resume=folder)
+
+
+def test_a_memory_that_counts_other_decisions_in_flight_is_refused():
+    with pytest.raises(InputError, match=r"ppo\.decision_ticks 4 is not env\.action\.decision_ticks, 1: .*null"):
+        load_train_settings(Path("smoke"), ("network.memory=gru", "ppo.decision_ticks=4"))

@@ -37,7 +37,7 @@ class NetworkSettings(Settings):
         description="in training, of the head choice: drawn anew in every decision, or staying with a frontier a while",
     )
     choice_momentum: float = Field(
-        default=2.0, ge=0.0, le=20.0,
+        default=0.0, ge=0.0, le=20.0,
         description="in flight, of the head choice: what the score of a frontier gains where the drone flies its way",
     )  # fmt: skip
     memory: MemoryKind = Field(
