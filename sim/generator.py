@@ -26,6 +26,11 @@ _DRAWS = 100
 Group = tuple[Piece, ...]
 
 
+def is_generated(name: str) -> bool:
+    """Tell whether a level's name, or a range of them, is of generated houses."""
+    return name.startswith(PREFIX)
+
+
 def level_by_seed(name: str) -> Level:
     """Return the generated level of a name such as house:7 or house:7:120. Raises InputError for any other name."""
     seed_text, colon, area_text = name.removeprefix(PREFIX).partition(":")

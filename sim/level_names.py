@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from imagine.core.errors import InputError
-from imagine.sim.generator import AREA_M2, PREFIX
+from imagine.sim.generator import AREA_M2, PREFIX, is_generated
 from imagine.sim.level_variants import level_shares
 from imagine.sim.map_image import IMAGE_SUFFIXES
 
@@ -31,7 +31,7 @@ def expand_level(name: str, where: str = "levels") -> tuple[str, ...]:
     stand one floor area in m² for all, or LOW-HIGH: then each house has an area of its own, see `house_area`. Raises
     InputError, which begins with `where`, on an empty or a too long range and on areas that no house has.
     """
-    if not name.startswith(PREFIX):
+    if not is_generated(name):
         return tuple(map(str, _numbers(name, name, where, "", ""))) if _RANGE.fullmatch(name) else (name,)
     seeds, colon, area = name.removeprefix(PREFIX).partition(":")
     if "-" not in seeds + area:
@@ -86,7 +86,7 @@ def reported_name(name: str) -> str:
 
     Built-in and generated levels are called as they are asked for, those of files by the file's name without suffix.
     """
-    if name.startswith(PREFIX):
+    if is_generated(name):
         return name
     file, at, _ = name.rpartition("@")
     return Path(file if at and Path(file).suffix.lower() in IMAGE_SUFFIXES else name).stem
@@ -94,7 +94,7 @@ def reported_name(name: str) -> str:
 
 def level_family(name: str) -> str:
     """Return what a level is counted under where figures are told by level: itself, or `houses` for generated ones."""
-    return "houses" if name.startswith(PREFIX) else name
+    return "houses" if is_generated(name) else name
 
 
 def _numbers(text: str, name: str, where: str, before: str, behind: str) -> range:

@@ -8,7 +8,7 @@ from pathlib import Path
 from imagine.core.config import parse_yaml, read_yaml
 from imagine.core.errors import InputError
 from imagine.sim.floorplan import load_floorplan
-from imagine.sim.generator import PREFIX, level_by_seed
+from imagine.sim.generator import is_generated, level_by_seed
 from imagine.sim.level import BUILT_IN, Level
 from imagine.sim.level_file import read_level
 from imagine.sim.map_image import IMAGE_SUFFIXES, load_image, load_map
@@ -19,7 +19,7 @@ def open_level(name: str) -> Level:
     if name in BUILT_IN:
         text = resources.files("imagine.sim").joinpath(f"levels/{name}.yaml").read_text(encoding="utf-8")
         return read_level(name, f"level {name}", *parse_yaml(text, f"level {name}"))
-    if name.startswith(PREFIX):
+    if is_generated(name):
         return level_by_seed(name)
     file, at, _ = name.rpartition("@")
     if at and Path(file).suffix.lower() in IMAGE_SUFFIXES:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from imagine.sim.generator import PREFIX
+from imagine.sim.generator import is_generated
 from imagine.train.atomic_file import write_atomically
 from imagine.train.evaluation import evaluate
 from imagine.train.policies import Policy
@@ -57,5 +57,5 @@ def write_final_evaluation(
 
 def evaluated_levels(levels: Sequence[str]) -> list[str]:
     """Return those of a run's levels that are flown at its end: all, but of generated houses only the first few."""
-    houses = [level for level in levels if level.startswith(PREFIX)]
+    houses = [level for level in levels if is_generated(level)]
     return sorted({level for level in levels if level not in houses} | set(houses[:_MOST_HOUSES]))

@@ -17,6 +17,7 @@ from imagine.core.config import Settings
 from imagine.core.errors import WorkError
 from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.metrics import EpisodeMetrics
+from imagine.train.batches import Batch
 from imagine.train.labels import LabelBuffer, Round, RoundBuffer
 from imagine.train.networks import Actor, Precision, at_precision
 from imagine.train.pilots import Pilot
@@ -164,6 +165,14 @@ def choice_loss(scores: Tensor, wanted: Tensor) -> Tensor:
     return loss.sum() / wanted.sum().clamp(min=1.0)
 
 
+@torch.no_grad()
+def _choices_of(guide: Actor, batch: Batch) -> Tensor:
+    """Return how likely a guide would choose each frontier, `[rows, n]`."""
+    scores = batch.decide(guide).scores
+    assert scores is not None
+    return torch.softmax(scores, dim=1)
+
+
 def learn(
     actor: Actor,
     optimiser: torch.optim.Optimizer,
@@ -181,8 +190,8 @@ def learn(
     if not len(buffer):
         return math.nan
     losses = []
-    guides = [] if reference is None or not isinstance(buffer, LabelBuffer) else [reference]
-    with at_precision(settings.precision, actor, *guides):
+    guide = reference if isinstance(buffer, LabelBuffer) else None
+    with at_precision(settings.precision, actor, *([] if guide is None else [guide])):
         for _ in range(settings.gradient_steps):
             batch = buffer.sample(settings.minibatch, generator)
             decisions, labels = batch.decide(actor), batch["labels"]
@@ -190,11 +199,8 @@ def learn(
                 loss = imitation_loss(batch.of_counted(decisions.mean), labels, settings.cosine_weight)
             else:
                 wanted = wanted_choices(batch["frontiers"], labels)
-                for guide in guides:
-                    with torch.no_grad():
-                        told = batch.decide(guide).scores
-                    assert told is not None
-                    wanted = torch.where(batch[_BY_REFERENCE] > 0.5, torch.softmax(told, dim=1), wanted)
+                if guide is not None:
+                    wanted = torch.where(batch[_BY_REFERENCE] > 0.5, _choices_of(guide, batch), wanted)
                 loss = choice_loss(batch.of_counted(decisions.scores), wanted)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]

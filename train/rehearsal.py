@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from imagine.sim.exploration import Exploration, Observation
 from imagine.sim.exploration_settings import ExplorationSettings
-from imagine.sim.generator import PREFIX
+from imagine.sim.generator import is_generated
 from imagine.sim.level_names import expand_levels
 from imagine.train.imitation import LabelSettings, Teacher
 from imagine.train.pilots import Actions, Pilot
@@ -49,7 +49,7 @@ class RehearsalSettings(LabelSettings):
         if self.as_designed is not None:
             changes["as_designed"] = self.as_designed
         levels, weights = expand_levels(env.levels, env.level_weights)
-        known = np.array([not level.startswith(PREFIX) for level in levels])
+        known = np.array([not is_generated(level) for level in levels])
         shares, share = np.array(weights), self.known_share
         if share is not None and shares[known].any() and shares[~known].any():
             shares[known] *= share / shares[known].sum()
@@ -92,8 +92,8 @@ class RehearsalPilot:
     def act(self, env: Exploration, observation: Observation, worlds: NDArray[np.bool_] | None = None) -> Actions:
         """Return the actions of the pilot whose world it is, `[worlds, drones, action size]`; nan where it has none."""
         late = env.maps.coverage() >= self._late_coverage
-        houses = [level.name.startswith(PREFIX) for level in env.twin.levels]
-        designed = env.as_designed & ~late & ~np.array(houses)
+        houses = np.array([is_generated(level.name) for level in env.twin.levels])
+        designed = env.as_designed & ~late & ~houses
         self.by_reference = ~late & ~designed
         wanted = np.ones(env.worlds, np.bool_) if worlds is None else worlds
         actions = np.full((env.worlds, env.drones, env.settings.action.size), np.nan, np.float32)

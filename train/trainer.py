@@ -144,9 +144,7 @@ class Trainer:
         """Let the student fly and learn from the planner's labels, round after round."""
         settings = self.settings.imitation
         teacher = baseline(settings.teacher, self.settings.run.seed)
-        self._observation = self._learn_labels(
-            self.env, self._observation, self._recall, teacher, settings, settings.agent_steps
-        )
+        self._observation = self._learn_labels(self.env, self._observation, self._recall, teacher, settings)
         if not self._stop.is_set():
             self.phase, self.updates = "ppo", 0
             if not self.settings.run.rollout_workers:
@@ -171,21 +169,21 @@ class Trainer:
         )  # fmt: skip
         learner.imitation.state.clear()
         recall = Recall.nothing(learner.actor, env.worlds * env.drones)
-        self._learn_labels(env, env.reset(), recall, teacher, settings, settings.agent_steps, before)
+        self._learn_labels(env, env.reset(), recall, teacher, settings, before)
         self._source = None
         self._last = None if self._stop.is_set() else self.checkpoint()
 
     def _learn_labels(
         self, env: Exploration, observation: Observation, recall: Recall, teacher: Pilot, settings: LabelSettings,
-        agent_steps: int, reference: Actor | None = None,
+        reference: Actor | None = None,
     ) -> Observation:  # fmt: skip
-        """Gather labels and learn from them, round after round, until there are so many; return what is seen then."""
-        learner, phase = self.learner, self.phase
+        """Gather labels and learn from them, round after round, until the phase is over; return what is seen then."""
+        learner, phase, total = self.learner, self.phase, self._total(self.phase)
         every = 1 if learner.actor.state_size else settings.label_every
         buffer = label_buffer(learner.actor, settings.buffer_samples)
         teacher.begin(env)
-        while self.agent_steps[phase] < agent_steps and not self._stop.is_set():
-            done_share = self.agent_steps[phase] / agent_steps
+        while self.agent_steps[phase] < total and not self._stop.is_set():
+            done_share = self.agent_steps[phase] / total
             began = time.monotonic()
             until = max(settings.planner_share_until, 1e-9)
             planner_share = settings.planner_share * max(0.0, 1.0 - done_share / until)
@@ -201,7 +199,7 @@ class Trainer:
             asked = math.ceil(settings.round_steps / every) * env.worlds * env.drones
             numbers = {"loss": loss, "planner_share": planner_share, "labelled_share": labels / asked}
             seconds = {"collect": collected - began, "learn": time.monotonic() - collected}
-            self._after_update(env, steps, agent_steps, numbers, seconds, episodes)
+            self._after_update(env, steps, total, numbers, seconds, episodes)
         return observation
 
     def _own_rollouts(self) -> OwnRollouts:

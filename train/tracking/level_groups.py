@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from imagine.sim.generator import PREFIX
+from imagine.sim.generator import is_generated
 from imagine.sim.level import BUILT_IN
 from imagine.sim.map_image import IMAGE_SUFFIXES
 
@@ -28,7 +28,7 @@ class LevelGroups:
 
     def __call__(self, level: str) -> str:
         """Return the group of a level, by its name in the settings or, where files are stems, in an episode."""
-        if level.startswith(PREFIX):
+        if is_generated(level):
             return HOUSES
         if level in BUILT_IN:
             return level
@@ -36,7 +36,7 @@ class LevelGroups:
 
 
 def _is_file(level: str) -> bool:
-    return not level.startswith(PREFIX) and _stem(level) != level
+    return not is_generated(level) and _stem(level) != level
 
 
 def _stem(level: str) -> str:
